@@ -225,7 +225,28 @@ def lines_of(package: str = "") -> int:
 
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
-BOUNDS: dict[str, int] = {}
+BOUNDS = {
+    "": 85180,
+    "analytic": 730,
+    "apps": 16300,
+    "backends": 970,
+    "base": 2340,
+    "cli": 2470,
+    "dataset": 9910,
+    "design": 2810,
+    "extraction": 7250,
+    "eye": 3220,
+    "folders": 1590,
+    "gaze": 4550,
+    "imaging": 2170,
+    "optics": 5180,
+    "population": 2520,
+    "region": 4020,
+    "rendering": 12520,
+    "report": 970,
+    "rig": 3030,
+    "scene": 2100,
+}
 
 
 @pytest.mark.parametrize("package", BOUNDS)
@@ -278,9 +299,9 @@ LARGE = {
 # Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose
 # first fields users give in order.
 POSITIONAL = {
-    "Biconic", "Descent", "EyeImage", "EyePicture", "Finding", "GradientMedium", "GridSurface", "GuestrinEizenman",
-    "LashPlan", "Outcome", "Patch", "Pixels", "Quadric", "Regression", "Scene", "Score",
-    "Stop", "Sums", "Surface", "Table", "Visible", "ZernikeSurface", "_Table",
+    "Biconic", "BoundaryPixels", "CalibrationErrors", "Descent", "DeviceSurface", "EyeImage", "EyePicture",
+    "Finding", "FunctionErrors", "GradientMedium", "GridSurface", "GuestrinEizenman", "LashPlan", "Patch", "Quadric",
+    "Regression", "Scene", "Score", "Stop", "Sums", "Table", "Visible", "ZernikeSurface", "_Table",
 }  # fmt: skip
 
 

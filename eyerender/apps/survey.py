@@ -22,11 +22,10 @@ from ..folders.imagefile import preview as eight_bit
 from ..folders.outfolder import staged
 from ..imaging.capture import make_renderer, render_windows
 from ..population.people import PopulationSpec
-from ..population.statistics import Moments, Refusals, Survey, pieces, refusals, survey
-from ..population.table import Source, Table, default_table
+from ..population.statistics import Moments, PopulationStatistics, Refusals, pieces, refusals, survey
+from ..population.table import PopulationTable, Source, default_table
 from ..report.overlay import picture
-from ..report.page import Card, Content, Figure, Page, Section, write_page
-from ..report.page import Table as PageTable
+from ..report.page import Card, Content, Figure, Page, Section, Table, write_page
 from ..report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
 from ..scene import Scene
 from ..scene.people import Population
@@ -64,7 +63,7 @@ class Result:
 
     population: PopulationSpec
     seed: int
-    statistics: Survey
+    statistics: PopulationStatistics
     refused: Refusals
 
     def to_mapping(self) -> dict[str, Any]:
@@ -259,7 +258,7 @@ def page_of(found: Result, sheet: Image.Image | None) -> Page:
         )
     rows = [(reason, str(number)) for reason, number in sorted(r.reasons.items(), key=lambda item: -item[1])]
     if rows:
-        refused.append(PageTable(("reason", "eyes"), rows, wide=(0,)))
+        refused.append(Table(("reason", "eyes"), rows, wide=(0,)))
     sections.append(Section("What physics refuses", *refused))
     sections.append(Section("Sources", _MARKS, _sources(table, found.population)))
     lead = table.presets[found.population.preset].description.capitalize() + "."
@@ -284,7 +283,7 @@ def _lead(found: Result) -> str | None:
     return f"Only people with {told}; the table's values are of all people, so they are left out."
 
 
-def _histograms(s: Survey) -> str:
+def _histograms(s: PopulationStatistics) -> str:
     shown = [m for name in _SHOWN for m in s.moments if m.name == name]
     with figure(13.0, 2.1 * -(-len(shown) // 5), 5, -(-len(shown) // 5)) as (fig, axes):
         flat = np.atleast_1d(axes).ravel()
@@ -302,7 +301,7 @@ def _histograms(s: Survey) -> str:
         return svg(fig)
 
 
-def _matrix(s: Survey) -> str:
+def _matrix(s: PopulationStatistics) -> str:
     names = [name for name in _MATRIX if name in s.names]
     at = [s.names.index(name) for name in names]
     r = s.correlation[np.ix_(at, at)]
@@ -314,7 +313,7 @@ def _matrix(s: Survey) -> str:
         return svg(fig)
 
 
-def _quantities(s: Survey, table: Table) -> PageTable:
+def _quantities(s: PopulationStatistics, table: PopulationTable) -> Table:
     rows = [
         (m.name, _number(m.expected_mean), f"{_number(m.mean)} ± {m.mean_error:.1g}", _number(m.expected_sd),
          f"{_number(m.sd)} ± {m.sd_error:.1g}", _off(m), _marks(table, m.name))
@@ -322,14 +321,14 @@ def _quantities(s: Survey, table: Table) -> PageTable:
     ]  # fmt: skip
     header = ("quantity", "mean, table", "mean, drawn", "SD, table", "SD, drawn", "off by (standard errors)", "marks")
     caption = "Means and standard deviations, with standard errors; of the eyes, the right ones."
-    return PageTable(header, rows, caption, wide=(6,))
+    return Table(header, rows, caption, wide=(6,))
 
 
 def _off(m: Moments) -> str:
     return "-" if not np.isfinite(m.expected_mean) else " ".join(f"{e:+.1f}" for e in m.errors)
 
 
-def _correlations(s: Survey) -> PageTable:
+def _correlations(s: PopulationStatistics) -> Table:
     rows = [
         (" - ".join(p.pair), f"{p.told:.2f}", f"{p.expected:.3f}", f"{p.r:.3f} ± {p.error:.3f}", f"{p.off:+.1f}",
          f"{p.mark}: {p.text}")
@@ -337,10 +336,10 @@ def _correlations(s: Survey) -> PageTable:
     ]  # fmt: skip
     header = ("pair", "source", "joint distribution", "drawn", "off by (standard errors)", "where from")
     caption = "The source's value may be of residuals; all other values are of the quantities themselves."
-    return PageTable(header, rows, caption, wide=(5,))
+    return Table(header, rows, caption, wide=(5,))
 
 
-def _sources(table: Table, population: PopulationSpec) -> PageTable:
+def _sources(table: PopulationTable, population: PopulationSpec) -> Table:
     rows = []
     for name, quantity in table.quantities.items():
         told: tuple[Source, ...] = quantity.sources
@@ -352,10 +351,10 @@ def _sources(table: Table, population: PopulationSpec) -> PageTable:
         rows += [(name, source.what, source.mark, source.text) for source in told]
     rows += [(name, "value", constant.mark, constant.text) for name, constant in table.constants.items()]
     header = ("quantity", "what", "mark", "source")
-    return PageTable(header, rows, "Every number and its source", wide=(3,), folded=True)
+    return Table(header, rows, "Every number and its source", wide=(3,), folded=True)
 
 
-def _marks(table: Table, name: str) -> str:
+def _marks(table: PopulationTable, name: str) -> str:
     if name not in table.quantities:
         return "follows"
     return ", ".join(dict.fromkeys(source.mark for source in table.quantities[name].sources))

@@ -22,7 +22,7 @@ from ..scene import Frames, Scene
 from .information import case_of, whitened_slopes
 from .noise import FeatureNoise, sensor_noise
 from .unknowns import COUNT, Unknowns
-from .varied import Slopes, slopes_of
+from .varied import FeatureSlopes, slopes_of
 
 VAGUE = 1e-6
 """Precision of unknown numbers, per rad^2 or mm^2, so that frames without features have a determinant."""
@@ -89,7 +89,7 @@ def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
     return replace(some, glint_px=sensor_noise(scene).glint_px)
 
 
-def site_matrices(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
+def site_matrices(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
     """Compute information in each of n views: (n, 23, 23) of the outline and (m, n, 23, 23) of each LED's glint."""
     across, glints = whitened_slopes(slopes, noise, camera)
     glints = np.moveaxis(glints, 1, 0)

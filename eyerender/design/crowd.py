@@ -13,7 +13,7 @@ from ..base.arrays import Floats, finite_or_none
 from ..base.processes import mapper
 from ..base.progress import Progress, notify
 from .noise import FeatureNoise
-from .people import Figures, Survey, figures_of
+from .people import Figures, RigPopulation, figures_of
 
 OUTLINE = 0.6
 """Share of the outline that counts as enough (chosen)."""
@@ -21,7 +21,12 @@ _PIECE = 20
 
 
 def figures_of_people(
-    survey: Survey, noise: FeatureNoise, people: int, *, workers: int | None = None, progress: Progress | None = None
+    survey: RigPopulation,
+    noise: FeatureNoise,
+    people: int,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> Figures:
     """Compute the figures of the first people, in pieces that do not depend on the number of processes.
 
@@ -45,7 +50,7 @@ SHIFTS_MM = (-3.0, -1.5, 0.0, 1.5, 3.0)
 
 
 def figures_of_shifts(
-    survey: Survey, noise: FeatureNoise, people: int, *, workers: int | None = None
+    survey: RigPopulation, noise: FeatureNoise, people: int, *, workers: int | None = None
 ) -> tuple[Floats, list[Figures]]:
     """Compute the figures of a few people at shifted positions: 5 x 5 to the left and up, and 5 in distance.
 

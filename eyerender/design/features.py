@@ -17,7 +17,7 @@ from ..base.status import Status
 from ..scene.observation import Observations
 from .noise import FeatureNoise
 from .unknowns import COUNT
-from .varied import Images, Slopes
+from .varied import FeatureSlopes, ModelFeatures
 
 ELLIPSE_POINTS, MOST_POINTS = 24, 40
 MODEL_PX = 0.02
@@ -31,7 +31,7 @@ _LEAST_RATIO = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Measured(ArrayValue):
+class MeasuredFeatures(ArrayValue):
     """Observed features of n views.
 
     Attributes:
@@ -48,7 +48,7 @@ class Measured(ArrayValue):
     glints_px: Floats
     glint_white: Floats
 
-    def take(self, rows: Ints) -> Measured:
+    def take(self, rows: Ints) -> MeasuredFeatures:
         """Select views."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self.__slots__})
 
@@ -63,7 +63,7 @@ class Measured(ArrayValue):
         return int(self.outline_size.sum() + 2 * self.has_glint.sum())
 
 
-def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Measured:
+def measured(observations: Observations, noise: FeatureNoise, lights: int) -> MeasuredFeatures:
     """Convert observations to whitened features.
 
     Covariances are those of the observations plus that of `MODEL_PX`, or, where these are missing, those of `noise`.
@@ -81,7 +81,9 @@ def measured(observations: Observations, noise: FeatureNoise, lights: int) -> Me
         usable = found & np.isfinite(covariance).all(axis=(1, 2))
         weights[usable, light] = _whitening(covariance[usable])
         glints[usable, light] = place[usable]
-    return Measured(outline_px=points, outline_white=white, outline_size=size, glints_px=glints, glint_white=weights)
+    return MeasuredFeatures(
+        outline_px=points, outline_white=white, outline_size=size, glints_px=glints, glint_white=weights
+    )
 
 
 def _covariance_of(observations: Observations, light: int) -> Floats:
@@ -180,15 +182,15 @@ class Residuals:
     glint_ok: Bools
 
 
-def residuals(seen: Measured, model: Images | Slopes) -> Residuals:
+def residuals(seen: MeasuredFeatures, model: ModelFeatures | FeatureSlopes) -> Residuals:
     """Compute the residuals of observed features from a model; features that the model lacks have residuals 0."""
-    images = model.images if isinstance(model, Slopes) else model
+    images = model.images if isinstance(model, FeatureSlopes) else model
     whole = np.isfinite(images.outline_px).all(axis=(1, 2)) & (seen.outline_size > 0)
     k, m = seen.outline_px.shape[1], seen.glints_px.shape[1]
     outline, by_outline = np.zeros((len(whole), k)), np.zeros((len(whole), k, COUNT))
     rows = np.flatnonzero(whole)
     if len(rows):
-        slopes = model.outline[rows] if isinstance(model, Slopes) else None
+        slopes = model.outline[rows] if isinstance(model, FeatureSlopes) else None
         distance, by = outline_distances(images.outline_px[rows], slopes, seen.outline_px[rows])
         outline[rows] = np.einsum("nij,nj->ni", seen.outline_white[rows], distance)
         if by is not None:
@@ -197,7 +199,7 @@ def residuals(seen: Measured, model: Images | Slopes) -> Residuals:
     gap = np.where(ok[..., None], seen.glints_px - images.glints_px, 0.0)
     glints = np.einsum("nmij,nmj->nmi", seen.glint_white, gap)
     by_glints = np.zeros((len(whole), m, 2, COUNT))
-    if isinstance(model, Slopes):
+    if isinstance(model, FeatureSlopes):
         by_glints = np.where(ok[..., None, None], -seen.glint_white @ model.glints, 0.0)
     return Residuals(
         outline=outline,

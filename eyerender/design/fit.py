@@ -24,7 +24,7 @@ from ..eye.spec import EyeSpec
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import EYES, Observations
 from .eyefile import changed_file
-from .features import Measured, Residuals, measured, residuals, sized
+from .features import MeasuredFeatures, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information
 from .noise import FeatureNoise
 from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, PERSON, PUPIL, Unknowns
@@ -71,7 +71,7 @@ class Problem:
     """
 
     views: Views
-    seen: Measured
+    seen: MeasuredFeatures
     instant: Ints
     instants: Views
     target_mm: Floats

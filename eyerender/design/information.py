@@ -24,7 +24,16 @@ from ..scene import Frames
 from ..scene.observation import EYES
 from .noise import FeatureNoise, sensor_noise
 from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, NAMES, PERSON, PUPIL, Unknowns
-from .varied import Slopes, Views, diameters_mm, gaze_slopes, lines_of_sight, slopes_of, stacked_eyes, target_slopes
+from .varied import (
+    FeatureSlopes,
+    Views,
+    diameters_mm,
+    gaze_slopes,
+    lines_of_sight,
+    slopes_of,
+    stacked_eyes,
+    target_slopes,
+)
 
 UNSEEN = 1e-11
 """Eigenvalues of the information, scaled to a unit diagonal, below which a direction is undetermined."""
@@ -95,7 +104,7 @@ def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
     return np.where(usable[..., None], normal, 0.0), np.where(usable, speed * spacing, 0.0)
 
 
-def whitened_slopes(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
+def whitened_slopes(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
     """Compute derivatives over noise in n views: (n, k, 23) across the outline and (n, m, 2, 23) of glints."""
     normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
     size = np.sqrt(length) / noise.outline_px[camera][:, None]
@@ -104,7 +113,7 @@ def whitened_slopes(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> tuple[
     return across, slopes.glints * weight[..., None, None]
 
 
-def information_of_views(slopes: Slopes, noise: FeatureNoise, camera: Ints) -> Floats:
+def information_of_views(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> Floats:
     """Compute the information (n, 23, 23) of outline and glints in each view, the first two sums of equation (3)."""
     across, glints = whitened_slopes(slopes, noise, camera)
     rows = np.concatenate([across, glints.reshape(len(camera), -1, COUNT)], axis=1)

@@ -36,7 +36,7 @@ from .choice import SiteInformation, joined, site_matrices, with_priors
 from .information import Case, information_of_views, target_information
 from .noise import FeatureNoise
 from .unknowns import AZIMUTH, COUNT, ELEVATION, LOCAL, PUPIL, Unknowns
-from .varied import Slopes, Views, diameters_mm, gaze_slopes, slopes_of, stacked_eyes
+from .varied import FeatureSlopes, Views, diameters_mm, gaze_slopes, slopes_of, stacked_eyes
 
 POINTS = 16
 GRID = 9
@@ -52,7 +52,7 @@ LOST = ("ray", "sensor", "lid")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Survey:
+class RigPopulation:
     """A rig and the population in front of it.
 
     Attributes:
@@ -127,7 +127,7 @@ class Someone:
     place_mm: Floats
 
 
-def people_of(survey: Survey, first: int, count: int) -> tuple[list[Someone], list[int]]:
+def people_of(survey: RigPopulation, first: int, count: int) -> tuple[list[Someone], list[int]]:
     """Draw people; return those with a possible eye, and the numbers of the others.
 
     A person depends on the seed and the number alone. The distance of the pupils moves the eye against the rig.
@@ -150,7 +150,7 @@ def people_of(survey: Survey, first: int, count: int) -> tuple[list[Someone], li
     return found, refused
 
 
-def place_of(survey: Survey, scene: Scene, person: Person) -> Floats:
+def place_of(survey: RigPopulation, scene: Scene, person: Person) -> Floats:
     """Compute the apex (3,) mm of a person's unrotated eye in the world.
 
     It is that of the scene, moved by half the difference in interpupillary distance and by a random slippage.
@@ -165,7 +165,7 @@ def place_of(survey: Survey, scene: Scene, person: Person) -> Floats:
     return np.asarray(place + shift + np.array([0.0, half if side == "left" else -half, 0.0]))
 
 
-def figures_of(survey: Survey, noise: FeatureNoise, first: int, count: int) -> Figures:
+def figures_of(survey: RigPopulation, noise: FeatureNoise, first: int, count: int) -> Figures:
     """Compute the figures of some people."""
     scene = Scene.of(SceneSpec.from_mapping(survey.scene))
     everyone, refused = people_of(survey, first, count)
@@ -179,7 +179,7 @@ def figures_of(survey: Survey, noise: FeatureNoise, first: int, count: int) -> F
     return Figures.joined(parts)
 
 
-def sites_seen(survey: Survey, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
+def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
     """Compute the information that each LED adds for the first people with an eye, in the nine calibration directions.
 
     All rays are traced once, for any number of `noises`; the result has one item for each.
@@ -218,7 +218,7 @@ def _nobody(refused: list[int]) -> Figures:
     )
 
 
-def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: list[Someone]) -> Figures:
+def _of_group(survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, people: list[Someone]) -> Figures:
     """Compute figures of a few people at once, camera by camera."""
     case = _case(survey, rig, people)
     i, m = len(case.theta), len(rig.lights)
@@ -247,7 +247,7 @@ def _of_group(survey: Survey, rig: RigGeometry, noise: FeatureNoise, people: lis
     )
 
 
-def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
+def _case(survey: RigPopulation, rig: RigGeometry, people: list[Someone]) -> Case:
     """Create a case of all directions of some people, one instant each; the camera is set later."""
     eyes = stacked_eyes([one.eye for one in people])
     cells = GRID * GRID
@@ -261,7 +261,7 @@ def _case(survey: Survey, rig: RigGeometry, people: list[Someone]) -> Case:
     return Case(views=views, instant=np.arange(len(person)), instants=views, theta=theta, target_mm=nowhere)
 
 
-def _openings(survey: Survey, people: list[Someone]) -> Floats:
+def _openings(survey: RigPopulation, people: list[Someone]) -> Floats:
     """Compute inner margins of the lids around the eye in the world, (i, columns, 3) mm.
 
     They depend mostly on elevation, so they are computed at three azimuths and interpolated.
@@ -287,7 +287,7 @@ def _openings(survey: Survey, people: list[Someone]) -> Floats:
     return np.concatenate(out)
 
 
-def visible(slopes: Slopes, camera: PinholeCamera, openings: Floats | None) -> tuple[Slopes, Ints]:
+def visible(slopes: FeatureSlopes, camera: PinholeCamera, openings: Floats | None) -> tuple[FeatureSlopes, Ints]:
     """Return the features that the lids leave visible, and the numbers (n, 3) of glints lost by reason (`LOST`)."""
     traced = np.isfinite(slopes.images.glints_px).all(axis=2)
     inside = np.where(traced, slopes.glint_ok, False)

@@ -83,7 +83,7 @@ class Views:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Images:
+class ModelFeatures:
     """Features of n views: outline (n, k, 2) px and glints (n, m, 2) px, and which exist and are on the sensor."""
 
     outline_px: Floats
@@ -93,7 +93,7 @@ class Images:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Slopes:
+class FeatureSlopes:
     """Features of n views with their derivatives with respect to the 23 unknowns.
 
     Attributes:
@@ -104,7 +104,7 @@ class Slopes:
         glint_ok: (n, m) the same for glints.
     """
 
-    images: Images
+    images: ModelFeatures
     outline: Floats
     glints: Floats
     outline_ok: Bools
@@ -234,7 +234,7 @@ def diameters_mm(eyes: EyeModel) -> Floats:
     return np.asarray(2.0 * np.sqrt(np.prod(eyes.stop.semi_axes_mm, axis=-1)))
 
 
-def images_of(views: Views, theta: Floats, boundary_points: int) -> Images:
+def images_of(views: Views, theta: Floats, boundary_points: int) -> ModelFeatures:
     """Trace the features of views with unknowns (n, 23)."""
     n, m, k = len(views), len(views.rig.lights), boundary_points
     outline, glints = np.full((n, k, 2), np.nan), np.full((n, m, 2), np.nan)
@@ -245,7 +245,7 @@ def images_of(views: Views, theta: Floats, boundary_points: int) -> Images:
             block = rows[part]
             seen = _images_of_camera(views.take(block), theta[block], int(number), k)
             outline[block], outline_ok[block], glints[block], glint_ok[block] = seen
-    return Images(outline_px=outline, outline_ok=outline_ok, glints_px=glints, glint_ok=glint_ok)
+    return ModelFeatures(outline_px=outline, outline_ok=outline_ok, glints_px=glints, glint_ok=glint_ok)
 
 
 def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple[Floats, Bools, Floats, Bools]:
@@ -267,7 +267,7 @@ def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple
     return outline[:, :-1], outline_ok[:, :-1], *projected(exits, status)
 
 
-def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | None = None) -> Slopes:
+def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | None = None) -> FeatureSlopes:
     """Trace features and their derivatives with respect to the unknowns, by central differences in one batch.
 
     Derivatives by the shapes of cornea and pupil (from `TORICITY` on) that are not `free` (23,) are 0.
@@ -304,13 +304,13 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
 
     outline, outline_ok = slopes(traced.outline_px, traced.outline_ok)
     glints, glint_ok = slopes(traced.glints_px, traced.glint_ok)
-    first = Images(
+    first = ModelFeatures(
         outline_px=traced.outline_px[:n],
         outline_ok=traced.outline_ok[:n],
         glints_px=traced.glints_px[:n],
         glint_ok=traced.glint_ok[:n],
     )
-    return Slopes(images=first, outline=outline, glints=glints, outline_ok=outline_ok, glint_ok=glint_ok)
+    return FeatureSlopes(images=first, outline=outline, glints=glints, outline_ok=outline_ok, glint_ok=glint_ok)
 
 
 def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:

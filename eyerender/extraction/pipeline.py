@@ -12,7 +12,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats
 from ..base.jit import ensure_compiled
 from ..optics.ellipse import signed_distance
-from .glints.classification import Eye, classify_spots
+from .glints.classification import EyeContext, classify_spots
 from .glints.deblending import give_edges, split_blends
 from .glints.detection import Spots, detect_spots, search_reach, widest
 from .glints.fits import SpotFit
@@ -21,7 +21,7 @@ from .glints.gaussian_model import Limits
 from .glints.patches import measure_patches
 from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
 from .glints.windows import window_radius
-from .preprocessing import DN, Part, Prepared, prepare
+from .preprocessing import DN, ImagePart, Prepared, prepare
 from .pupil.boundary import PupilCandidate
 from .pupil.consensus import far_off
 from .pupil.covariance import boundary_deviation
@@ -107,7 +107,7 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     if not pupil.ok:
         return _nothing(pupil, noise, size)
     iris, step = _iris_level(prepared, found, model), model.step_dn
-    eye = Eye(
+    eye = EyeContext(
         ellipse=model.ellipse,
         blur_px=model.sigma_px,
         pupil_dn=iris + step if found.image.inverted else iris - step,
@@ -168,8 +168,8 @@ def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotF
 
 
 def _without_spots(
-    prepared: Prepared, part: Part, found: PupilCandidate, spots: Spots, fit: SpotFit
-) -> tuple[Part, Bools]:
+    prepared: Prepared, part: ImagePart, found: PupilCandidate, spots: Spots, fit: SpotFit
+) -> tuple[ImagePart, Bools]:
     """Subtract well-fitted spots from a part of the image; also return the mask of pixels that other spots affect."""
     if found.image.inverted:
         upright = part_about(prepared.linear, found.boundary.ellipse)
@@ -180,7 +180,7 @@ def _without_spots(
 
 
 def _boundary_fit(
-    found: PupilCandidate, cleaned: tuple[Part, Bools], before: PixelFit | None = None
+    found: PupilCandidate, cleaned: tuple[ImagePart, Bools], before: PixelFit | None = None
 ) -> PixelFit | None:
     try:
         scatter = found.boundary.residual_px

@@ -57,7 +57,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class ImagePart:
     """A part of an image.
 
     Attributes:

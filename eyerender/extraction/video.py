@@ -50,7 +50,7 @@ _TINT = 8  # levels between channels that lossy codecs leave in grey images
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class VideoFrame:
     """A video frame: number, time in s (NaN if unknown), grey image (h, w), and whether the file has colour."""
 
     number: int
@@ -95,7 +95,7 @@ class VideoReader:
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.count = int(count) if 0 < count < 1e9 else 0
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[VideoFrame]:
         number = 0
         while True:
             good, picture = self._capture.read()
@@ -106,7 +106,7 @@ class VideoReader:
             first = picture.reshape(*picture.shape[:2], -1)[..., 0]
             grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if tint else first
             colour = tint > _TINT
-            yield Frame(number, time_s, np.ascontiguousarray(grey, dtype=np.uint8), colour)
+            yield VideoFrame(number, time_s, np.ascontiguousarray(grey, dtype=np.uint8), colour)
             number += 1
         self._capture.release()
         if number == 0:
@@ -131,12 +131,12 @@ def _capture(path: str, reader: str) -> cv2.VideoCapture:
 
 
 def follow(
-    frames: Iterator[Frame] | VideoReader,
+    frames: Iterator[VideoFrame] | VideoReader,
     *,
     gamma: float = 1.0,
     settings: ExtractionSettings | None = None,
     eyes: int = 1,
-) -> Iterator[tuple[Frame, tuple[Extraction, ...]]]:
+) -> Iterator[tuple[VideoFrame, tuple[Extraction, ...]]]:
     """Extract the features of each frame; the search starts at the pupil of the previous frame.
 
     Args:

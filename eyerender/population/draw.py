@@ -29,7 +29,7 @@ from ..base.arrays import Bools, Floats, Indices
 from ..base.errors import InputError
 from .marginals import Share, Uniform, truncated
 from .model import Model
-from .table import ROOTS, Distribution, Regression
+from .table import ROOTS, Distribution, QuantityRegression
 
 Condition = float | tuple[float, float]
 ATTEMPTS = 2000
@@ -81,7 +81,7 @@ class Conditions:
         cut: dict[str, tuple[float, float]] = {}
         for name, wanted in where.items():
             found, places = model.distributions[name], model.places(name)
-            if isinstance(found, Regression):
+            if isinstance(found, QuantityRegression):
                 if isinstance(wanted, int | float):
                     exact[name] = float(wanted)
                 else:
@@ -187,7 +187,7 @@ def _range(name: str, wanted: tuple[float, float] | float) -> tuple[float, float
 
 def _ends(name: str, found: Distribution, wanted: Condition) -> tuple[float, float]:
     """Convert the limits of a quantity with a marginal to limits of its latent number."""
-    assert not isinstance(found, Regression)
+    assert not isinstance(found, QuantityRegression)
     if isinstance(found, Share):
         number = float(found.latent(np.array(wanted))) if isinstance(wanted, int | float) else np.nan
         if not np.isfinite(number):

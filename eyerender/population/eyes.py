@@ -22,7 +22,7 @@ from ..eye.surfaces import index_at, stop_of, surface_of
 from ..optics.surfaces import Surface
 from .pupil import ellipticity
 from .refraction import AQUEOUS, CORNEA, LENS, VITREOUS
-from .table import Table
+from .table import PopulationTable
 
 LENS_MM_PER_D, LENS_MM_PER_D_YEAR = 0.058, -0.0005
 FRONT_PER_D, BACK_PER_D = 0.0077, 0.0043
@@ -37,7 +37,7 @@ _LIMBUS_GAP_MM = 0.35
 _DESIGN_NM = 850.0
 
 
-def amplitude_d(table: Table, age_years: float) -> float:
+def amplitude_d(table: PopulationTable, age_years: float) -> float:
     """Compute the accommodation amplitude (D) at an age."""
     return max(table.constant("amplitude_d") + table.constant("amplitude_d_per_year") * age_years, 0.0)
 
@@ -50,7 +50,7 @@ def thickening_mm(age_years: float, accommodation_d: float) -> float:
 def eye_file(
     name: str,
     eye: Mapping[str, float],
-    table: Table,
+    table: PopulationTable,
     *,
     age_years: float,
     accommodation_d: float,
@@ -98,7 +98,7 @@ def eye_file(
 class _Table:
     """Cache key: a table that is compared by identity."""
 
-    table: Table
+    table: PopulationTable
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Table) and other.table is self.table
@@ -148,7 +148,9 @@ def _accommodated(
     return _Accommodated(parts, front, tuple(index_at(s.medium, _DESIGN_NM, "cornea") for s in parts.cornea))
 
 
-def _mapping(name: str, eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> dict[str, Any]:
+def _mapping(
+    name: str, eye: Mapping[str, float], table: PopulationTable, age: float, accommodation: float
+) -> dict[str, Any]:
     """Return the keys of the eye file, with the stop at its reference diameter and the fovea on the optic axis."""
     constant = table.constant
     thicker = thickening_mm(age, accommodation)
@@ -207,7 +209,7 @@ def _cornea(eye: Mapping[str, float]) -> list[dict[str, Any]]:
     ]
 
 
-def _lens(eye: Mapping[str, float], table: Table, age: float, accommodation: float) -> list[dict[str, Any]]:
+def _lens(eye: Mapping[str, float], table: PopulationTable, age: float, accommodation: float) -> list[dict[str, Any]]:
     """Compute the front and back of the lens."""
     thicker = thickening_mm(age, accommodation)
     front_radius = 1.0 / (1.0 / eye["lens_front_radius_mm"] + FRONT_PER_D * accommodation)

@@ -28,7 +28,7 @@ from ..base.arrays import Floats
 from ..base.errors import InputError
 from ..eye.parts import Side
 from .correlation import completed, nearest_correlation
-from .table import ROOTS, Distribution, Pair, Quantity, Regression, Table, default_table
+from .table import ROOTS, CorrelatedPair, Distribution, PopulationTable, Quantity, QuantityRegression, default_table
 
 SIDES: tuple[Side, Side] = ("right", "left")
 _NODES, _ORDERS = 200, 16  # r^16 is below 1e-11 for the correlations of refraction and age
@@ -47,14 +47,14 @@ class Reference:
             matrix.
     """
 
-    table: Table
+    table: PopulationTable
     distributions: Mapping[str, Distribution]
     correlation: Floats
     latent: Floats
     distance: float
 
     @classmethod
-    def of(cls, table: Table) -> Reference:
+    def of(cls, table: PopulationTable) -> Reference:
         """Solve the residuals of a table.
 
         Raises:
@@ -136,7 +136,7 @@ class Model:
         """
         places, found = self.places(name), self.distributions[name]
         z = latent[:, places[0]] if len(places) == 1 else latent[:, places]
-        if isinstance(found, Regression):
+        if isinstance(found, QuantityRegression):
             return np.asarray(self.mean(name, latent, known) + found.residual_sd * z)
         return found.at(z)
 
@@ -146,7 +146,7 @@ class Model:
         A regression of a subject's quantity on the refraction uses the mean of both eyes.
         """
         found, places = self.distributions[name], self.places(name)
-        assert isinstance(found, Regression)
+        assert isinstance(found, QuantityRegression)
         shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
         mean: Floats = np.asarray(found.mean)
         for root, slope in found.slopes.items():
@@ -167,14 +167,14 @@ class Model:
         """Compute the latent numbers (n,) or (n, 2) that give a quantity one value."""
         found, places = self.distributions[name], self.places(name)
         shape = (len(latent),) if len(places) == 1 else (len(latent), 2)
-        if isinstance(found, Regression):
+        if isinstance(found, QuantityRegression):
             return np.asarray((value - self.mean(name, latent)) / found.residual_sd)
         return np.broadcast_to(found.latent(np.array(value)), shape)
 
     def expected(self, name: str) -> tuple[float, float]:
         """Compute the mean and standard deviation of a quantity, exactly."""
         found = self.distributions[name]
-        if not isinstance(found, Regression):
+        if not isinstance(found, QuantityRegression):
             return found.moments
         variance = found.residual_sd**2 + _explained(found, found, self.distributions, self.reference.table)
         return _mean(found, self.distributions), float(np.sqrt(variance))
@@ -184,7 +184,7 @@ class Model:
         a, b = self.distributions[first], self.distributions[second]
         i, j = self.places(first)[0], self.places(second)[0]
         latent = float(self.reference.latent[i, j])
-        if not (isinstance(a, Regression) and isinstance(b, Regression)):
+        if not (isinstance(a, QuantityRegression) and isinstance(b, QuantityRegression)):
             return latent
         explained = _explained(a, b, self.distributions, self.reference.table)
         shared = latent * a.residual_sd * b.residual_sd + explained
@@ -202,11 +202,11 @@ def _marginal(quantity: Quantity) -> Distribution:
     return quantity.marginal
 
 
-def _resolved(name: str, quantity: Quantity, table: Table, about: Mapping[str, float]) -> Distribution:
+def _resolved(name: str, quantity: Quantity, table: PopulationTable, about: Mapping[str, float]) -> Distribution:
     if quantity.marginal is not None:
         return quantity.marginal
     assert quantity.mean is not None
-    bare = Regression(
+    bare = QuantityRegression(
         mean=quantity.mean,
         residual_sd=1.0 if quantity.residual_sd is None else quantity.residual_sd,
         slopes=quantity.slopes,
@@ -222,10 +222,10 @@ def _resolved(name: str, quantity: Quantity, table: Table, about: Mapping[str, f
     return bare.model_copy(update={"residual_sd": float(np.sqrt(rest))})
 
 
-def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> float:
+def _latent(pair: CorrelatedPair, table: PopulationTable, found: Mapping[str, Distribution]) -> float:
     """Compute the correlation of the latent numbers of a pair."""
     a, b = (found[name] for name in pair.pair)
-    if pair.of == "residuals" or not (isinstance(a, Regression) and isinstance(b, Regression)):
+    if pair.of == "residuals" or not (isinstance(a, QuantityRegression) and isinstance(b, QuantityRegression)):
         return pair.r
     roots = {root: found[root] for root in ROOTS}
     spreads = [np.sqrt(q.residual_sd**2 + _explained(q, q, roots, table)) for q in (a, b)]
@@ -233,13 +233,15 @@ def _latent(pair: Pair, table: Table, found: Mapping[str, Distribution]) -> floa
     return float(np.clip(rest / (a.residual_sd * b.residual_sd), -0.999, 0.999))
 
 
-def _explained(a: Regression, b: Regression, roots: Mapping[str, Distribution], table: Table) -> float:
+def _explained(
+    a: QuantityRegression, b: QuantityRegression, roots: Mapping[str, Distribution], table: PopulationTable
+) -> float:
     """Compute the covariance of the means of two regressions in one eye."""
     pairs = [(p, q) for p in sorted(a.slopes) for q in sorted(b.slopes)]
     return sum(a.slopes[p] * b.slopes[q] * _covariance(p, q, roots, table) for p, q in pairs)
 
 
-def _covariance(first: str, second: str, roots: Mapping[str, Distribution], table: Table) -> float:
+def _covariance(first: str, second: str, roots: Mapping[str, Distribution], table: PopulationTable) -> float:
     """Compute the covariance of two predictors."""
     if first == second:
         return _moments(roots[first])[1] ** 2
@@ -252,7 +254,7 @@ def _covariance(first: str, second: str, roots: Mapping[str, Distribution], tabl
 
 def _hermite(found: Distribution) -> Floats:
     """Compute E[F(z) He_k(z)] for k >= 1 of the map F of a marginal."""
-    assert not isinstance(found, Regression)
+    assert not isinstance(found, QuantityRegression)
     z, weighted = _quadrature()
     return np.asarray(found.at(z) @ weighted)
 
@@ -264,11 +266,11 @@ def _quadrature() -> tuple[Floats, Floats]:
     return z, hermevander(z, _ORDERS - 1)[:, 1:] * (weight / weight.sum())[:, None]
 
 
-def _mean(found: Regression, roots: Mapping[str, Distribution]) -> float:
+def _mean(found: QuantityRegression, roots: Mapping[str, Distribution]) -> float:
     shifts = (slope * (_moments(roots[root])[0] - found.about[root]) for root, slope in found.slopes.items())
     return found.mean + sum(shifts)
 
 
 def _moments(found: Distribution) -> tuple[float, float]:
-    assert not isinstance(found, Regression)
+    assert not isinstance(found, QuantityRegression)
     return found.moments

@@ -27,7 +27,7 @@ from .marginals import Fixed
 from .model import SIDES, Model, default_reference
 from .pupil import watson_yellott_mm
 from .refraction import Biometry, Optics, solve
-from .table import ROOTS, Distribution, Regression, Table, default_table
+from .table import ROOTS, Distribution, PopulationTable, QuantityRegression, default_table
 
 SOLVED = tuple(field.name for field in fields(Optics))
 """Numbers of an eye that follow from its refraction."""
@@ -55,7 +55,7 @@ class PopulationSpec(Spec):
                 if name not in table.quantities:
                     raise KeyProblem(f"{key}.{name}", "no such quantity of the table")
         for root in ROOTS:
-            if isinstance(self.replace.get(root), Regression):
+            if isinstance(self.replace.get(root), QuantityRegression):
                 raise KeyProblem(f"replace.{root}", "must be a marginal, because the regressions start from it")
         for name, found in self.replace.items():
             if isinstance(found, Fixed) and name in self.where:
@@ -279,7 +279,9 @@ def chosen_person(data: object) -> Person:
     return _chosen(text)
 
 
-def far_pupil_mm(table: Table, luminance: float, field: float, age_years: Floats, score: Floats | float) -> Floats:
+def far_pupil_mm(
+    table: PopulationTable, luminance: float, field: float, age_years: Floats, score: Floats | float
+) -> Floats:
     """Compute entrance pupils (mm) of people who look far away: the mean for their age plus score times spread."""
     mean = watson_yellott_mm(luminance, field, age_years)
     small, large = table.constant("pupil_sd_small_mm"), table.constant("pupil_sd_large_mm")
@@ -305,7 +307,7 @@ def _values(model: Model, latent: Floats) -> dict[str, Floats]:
     return values
 
 
-def biometry(table: Table, values: Mapping[str, Floats]) -> Biometry:
+def biometry(table: PopulationTable, values: Mapping[str, Floats]) -> Biometry:
     """Return lengths and radii of people's eyes, (n, 2) each."""
     return Biometry(
         refraction=(values["refraction_d"], values["refraction_j0_d"], values["refraction_j45_d"]),

@@ -74,7 +74,7 @@ class PairStatistic:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Survey:
+class PopulationStatistics:
     """Statistics of n people."""
 
     n: int
@@ -107,7 +107,7 @@ def pieces(population: PopulationSpec, n: int, seed: int) -> Iterator[dict[str, 
         yield population.numbers(min(CHUNK, n - start), seed, first=start)
 
 
-def survey(population: PopulationSpec, n: int, seed: int = 0) -> Survey:
+def survey(population: PopulationSpec, n: int, seed: int = 0) -> PopulationStatistics:
     """Compare n people with the joint distribution; memory does not grow with n.
 
     Raises:
@@ -144,7 +144,7 @@ def survey(population: PopulationSpec, n: int, seed: int = 0) -> Survey:
         )
         for k, name in enumerate(names)
     )  # fmt: skip
-    return Survey(
+    return PopulationStatistics(
         n=n,
         moments=moments,
         pairs=tuple(_pairs(model, names, correlation, n, plain)),

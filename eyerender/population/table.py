@@ -28,7 +28,7 @@ class Source(Spec):
     text: str = Field(description="the source, and what it says")
 
 
-class Regression(Spec):
+class QuantityRegression(Spec):
     """Mean + sum of slopes (predictor - its `about`) + a normal residual."""
 
     kind: Literal["regression"] = Field(default="regression", description="the distribution")
@@ -47,7 +47,7 @@ class Regression(Spec):
         return self
 
 
-Distribution = Annotated[Fixed | Normal | Lognormal | Uniform | Share | Mixture | Regression, ByKind()]
+Distribution = Annotated[Fixed | Normal | Lognormal | Uniform | Share | Mixture | QuantityRegression, ByKind()]
 
 
 class Quantity(Spec):
@@ -77,7 +77,7 @@ class Quantity(Spec):
         return self
 
 
-class Pair(Spec):
+class CorrelatedPair(Spec):
     """Correlation of two quantities of one eye."""
 
     pair: tuple[str, str] = Field(description="the two quantities")
@@ -103,13 +103,13 @@ class Preset(Spec):
     sources: tuple[Source, ...] = Field(default=(), description="where the numbers come from")
 
 
-class Table(FileSpec):
+class PopulationTable(FileSpec):
     """A table of people."""
 
     name: str = Field(description="name of the table")
     reference: str = Field(description="the preset of which means, spreads and correlations are those of the table")
     quantities: dict[str, Quantity] = Field(description="name -> quantity")
-    correlations: tuple[Pair, ...] = Field(description="correlations within one eye")
+    correlations: tuple[CorrelatedPair, ...] = Field(description="correlations within one eye")
     constants: dict[str, Constant] = Field(description="name -> number")
     presets: dict[str, Preset] = Field(description="name -> population")
 
@@ -155,6 +155,6 @@ class Table(FileSpec):
 
 
 @cache
-def default_table() -> Table:
+def default_table() -> PopulationTable:
     """Return the table that comes with the package."""
-    return Table.load(FOLDER / "default.yaml")
+    return PopulationTable.load(FOLDER / "default.yaml")

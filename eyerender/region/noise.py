@@ -99,11 +99,11 @@ def nearest_two(seeds: Floats, x: Floats, y: Floats) -> tuple[Singles, NDArray[n
 
 
 def padded(tile: Singles) -> Singles:
-    """Repeat the first two rows and columns of a periodic tile behind the last ones, for `Places.sample`."""
+    """Repeat the first two rows and columns of a periodic tile behind the last ones, for `TilePlaces.sample`."""
     return np.pad(tile, (0, 2), "wrap")
 
 
-class Places:
+class TilePlaces:
     """Positions (x, y) mm on a periodic square, at which tiles of one size are sampled by linear interpolation."""
 
     def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:

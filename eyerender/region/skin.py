@@ -27,7 +27,7 @@ from .contour import step
 from .globe import Globe
 from .lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet, skin_depth
 from .look import Look
-from .noise import Places, band, furrows, padded
+from .noise import TilePlaces, band, furrows, padded
 from .tears import waves
 
 SHEET_ROWS, BANDS = 960, 64
@@ -218,11 +218,11 @@ class _Tiles:
         self.spec = spec
         self._made: dict[object, Singles] = {}
 
-    def at(self, number: int, places: Places, across: tuple[float, float], up: tuple[float, float]) -> Singles:
+    def at(self, number: int, places: TilePlaces, across: tuple[float, float], up: tuple[float, float]) -> Singles:
         """Sample a band of noise (see `noise.band`) at positions."""
         return self.mixed(places, (1.0, number, across, up))
 
-    def mixed(self, places: Places, *parts: tuple[float, int, tuple[float, float], tuple[float, float]]) -> Singles:
+    def mixed(self, places: TilePlaces, *parts: tuple[float, int, tuple[float, float], tuple[float, float]]) -> Singles:
         """Sample a weighted sum of bands of noise at positions."""
         key = places.size, *parts
         if key not in self._made:
@@ -255,8 +255,8 @@ class _Tiles:
         return low.astype(np.float32), (high - low).astype(np.float32)
 
 
-def _places(y: NDArray[Any], z: NDArray[Any], size: int = _TILE) -> Places:
-    return Places(size, y, z, 2 * _TILE_MM)
+def _places(y: NDArray[Any], z: NDArray[Any], size: int = _TILE) -> TilePlaces:
+    return TilePlaces(size, y, z, 2 * _TILE_MM)
 
 
 class _Slow:
@@ -327,7 +327,7 @@ class _Slow:
 def _hollows(behind: Singles, y: Singles, z: Singles) -> Singles:
     """Compute the loss of light, -0.05 to 0.25, in hollows of the face."""
     y, z = (np.clip(v + 76.0, 0, 151.999) for v in (y, z))
-    return np.asarray(np.clip(0.05 * Places(153, y, z, 153.0).sample(behind), -0.05, 0.25))
+    return np.asarray(np.clip(0.05 * TilePlaces(153, y, z, 153.0).sample(behind), -0.05, 0.25))
 
 
 @dataclass(kw_only=True)
@@ -443,16 +443,16 @@ class _Strip:
         The cells are wide on the face. On the lids they are stretched along the margin, like its creases.
         """
         y, z, tiles = self.y, self.z, self.tiles
-        cells = Places(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
+        cells = TilePlaces(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
         some = self.lids > 1e-4
         if np.any(some):
-            narrow = Places(_TILE, y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
+            narrow = TilePlaces(_TILE, y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
             cells[some] += self.lids[some] * (narrow.sample(tiles.drawn) - cells[some])
         return np.asarray(1 - (0.2 + 0.8 * self.patch) * (1 - cells))
 
     def bumps(self) -> Singles:
         """Sample the finest relief (mean 0, deviation about 0.8): bumps a quarter of a millimetre wide, in patches."""
-        places = Places(_TILE, self.y, self.level, _TILE_MM)
+        places = TilePlaces(_TILE, self.y, self.level, _TILE_MM)
         return self.tiles.at(17, places, (10, 40), (28, 68)) * (0.4 + 0.8 * self.patch)
 
     def relief(self, cells: Singles) -> Singles:

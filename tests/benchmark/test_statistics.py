@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from eyerender.apps.benchmark.asking import Run
+from eyerender.apps.benchmark.asking import ExtractorResults
 from eyerender.apps.benchmark.conventions import Conventions
 from eyerender.apps.benchmark.curves import curves_of
 from eyerender.apps.benchmark.failurekinds import kind_of
@@ -123,7 +123,7 @@ def answer(error, right=True, **more):
 
 
 def run_of(name, scores):
-    return Run(ExtractorCommand(name, name, ()), None, tuple(scores))
+    return ExtractorResults(ExtractorCommand(name, name, ()), None, tuple(scores))
 
 
 def test_errors_are_compared_on_the_pupils_that_both_find():
@@ -185,6 +185,6 @@ def test_half_a_pixel_suggests_the_other_origin(shift, declared, suggested):
     rng = np.random.default_rng(2)
     scores = tuple(Score("right", offset_px=tuple(np.add(shift, rng.normal(0.0, 0.2, 2)))) for _ in range(20))
     greeting = Greeting("a", Conventions(pixel_origin=declared), ("pupil",))
-    got = suggested_origin(Run(ExtractorCommand("a", "a", ()), greeting, scores))
+    got = suggested_origin(ExtractorResults(ExtractorCommand("a", "a", ()), greeting, scores))
     assert (got and got["suggested"]) == suggested
-    assert suggested_origin(Run(ExtractorCommand("a", "a", ()), greeting, scores[:7])) is None
+    assert suggested_origin(ExtractorResults(ExtractorCommand("a", "a", ()), greeting, scores[:7])) is None

@@ -17,7 +17,14 @@ from eyerender.design.information import (
 )
 from eyerender.design.noise import FeatureNoise, edge_information, glint_deviation, sensor_noise
 from eyerender.design.unknowns import COUNT, NAMES, POSITION, ROTATION, TORICITY, Unknowns
-from eyerender.design.varied import Images, Slopes, lines_of_sight, slopes_of, target_misses, target_slopes
+from eyerender.design.varied import (
+    FeatureSlopes,
+    ModelFeatures,
+    lines_of_sight,
+    slopes_of,
+    target_misses,
+    target_slopes,
+)
 from eyerender.eye.build import bare_eye, fitting_stop
 from eyerender.eye.parts import EyeParts
 from eyerender.eye.pose import Poses, rigid_motion
@@ -43,8 +50,10 @@ def test_a_circle_in_a_plane_has_the_closed_form():
     slopes[0, :, 0, 0] = slopes[0, :, 1, 1] = 1.0
     slopes[0, :, :, 2] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     ok, none = np.ones((1, count), dtype=bool), np.ones((1, 0), dtype=bool)
-    images = Images(outline_px=points[None], outline_ok=ok, glints_px=np.empty((1, 0, 2)), glint_ok=none)
-    circle = Slopes(images=images, outline=slopes, glints=np.empty((1, 0, 2, COUNT)), outline_ok=ok, glint_ok=none)
+    images = ModelFeatures(outline_px=points[None], outline_ok=ok, glints_px=np.empty((1, 0, 2)), glint_ok=none)
+    circle = FeatureSlopes(
+        images=images, outline=slopes, glints=np.empty((1, 0, 2, COUNT)), outline_ok=ok, glint_ok=none
+    )
     noise = FeatureNoise(outline_px=np.array([sigma]), glint_px=np.empty((1, 0)))
     found = information_of_views(circle, noise, np.zeros(1, dtype=int))[0, :3, :3]
     exact = np.diag([np.pi * radius, np.pi * radius, 2 * np.pi * radius]) / sigma**2

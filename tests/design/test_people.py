@@ -13,7 +13,7 @@ from eyerender.cli.main import run
 from eyerender.design.crowd import users_of
 from eyerender.design.information import information
 from eyerender.design.noise import sensor_noise
-from eyerender.design.people import GRID, Survey, figures_of, inside_polygon, people_of
+from eyerender.design.people import GRID, RigPopulation, figures_of, inside_polygon, people_of
 from eyerender.design.unknowns import Unknowns
 
 
@@ -21,7 +21,7 @@ from eyerender.design.unknowns import Unknowns
 def survey():
     scene = er.load_scene("head_mounted").spec.to_mapping()
     people = er.Population("adults").to_mapping()
-    return Survey(scene=scene, population=people, unknowns=Unknowns.population().to_mapping(), lids=False)
+    return RigPopulation(scene=scene, population=people, unknowns=Unknowns.population().to_mapping(), lids=False)
 
 
 def test_the_noise_of_a_frame_is_that_of_information(survey):
@@ -61,7 +61,7 @@ def test_lids_hide_features_when_they_close(survey, monkeypatch):
     from eyerender.design import people
 
     noise, real = sensor_noise(er.load_scene("head_mounted")), people.people_of
-    data = {**{name: getattr(survey, name) for name in Survey.__slots__}, "lids": True}
+    data = {**{name: getattr(survey, name) for name in RigPopulation.__slots__}, "lids": True}
 
     def blinking(amount):
         def made(survey, first, count):
@@ -78,7 +78,7 @@ def test_lids_hide_features_when_they_close(survey, monkeypatch):
             return closed, refused
 
         monkeypatch.setattr(people, "people_of", made)
-        return figures_of(Survey(**data), noise, 0, 1).outline.mean()
+        return figures_of(RigPopulation(**data), noise, 0, 1).outline.mean()
 
     wide, half, shut = (blinking(amount) for amount in (0.0, 0.6, 1.0))
     assert wide > 0.8

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from eyerender.apps.sweeps.run import GOALS, SweepRun, pareto, run_sweep
-from eyerender.apps.sweeps.spec import Places, SweepSpec, layouts_of
+from eyerender.apps.sweeps.spec import SweepSpec, SweptPlaces, layouts_of
 from eyerender.base.errors import InputError
 
 SWEEP: dict[str, Any] = {
@@ -33,10 +33,10 @@ def spec_of(**sweep: object) -> SweepSpec:
 
 
 def test_places_lie_evenly_on_curves_and_surfaces():
-    curve = Places.from_mapping({"curve_mm": [[0, 0, 0], [3, 0, 0], [3, 1, 0]], "count": 5}).places()
+    curve = SweptPlaces.from_mapping({"curve_mm": [[0, 0, 0], [3, 0, 0], [3, 1, 0]], "count": 5}).places()
     np.testing.assert_allclose(curve, [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [3, 1, 0]], atol=1e-12)
     corners = [[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0]]
-    grid = Places.from_mapping({"surface_mm": corners, "count": [3, 2]}).places()
+    grid = SweptPlaces.from_mapping({"surface_mm": corners, "count": [3, 2]}).places()
     np.testing.assert_allclose(grid, [[x, y, 0] for y in (0, 3) for x in (0, 1, 2)], atol=1e-12)
     for wrong in (
         {"points_mm": [[0, 0, 0]], "count": 1},
@@ -45,7 +45,7 @@ def test_places_lie_evenly_on_curves_and_surfaces():
         {},
     ):
         with pytest.raises(InputError):
-            Places.from_mapping(wrong)
+            SweptPlaces.from_mapping(wrong)
 
 
 def test_layouts_are_all_combinations_and_sensors_keep_their_size():

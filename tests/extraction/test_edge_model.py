@@ -11,7 +11,7 @@ import make_ideal_images as ideal
 from eyerender.extraction import extract
 from eyerender.extraction.pupil.covariance import reshaped, to_axes
 from eyerender.extraction.pupil.edge_model import EdgeModel, boundary_terms
-from eyerender.extraction.pupil.least_squares import Pixels, Sums
+from eyerender.extraction.pupil.least_squares import BoundaryPixels, Sums
 from eyerender.optics.ellipse import Ellipse, fit_ellipse_direct, signed_distance
 from tests.support import pixel_model
 
@@ -94,7 +94,7 @@ def test_jacobian_is_the_models_slope(b):
     model, x, y = _leaning(b)
     # One sector per pixel, and a residual of 1 everywhere: the sums of slopes times residual are the slopes.
     each = np.arange(x.size)
-    slopes = Sums.of(Pixels(x, y, model.level(x, y) + 1.0, each, each), model, np.zeros(x.size)).pull
+    slopes = Sums.of(BoundaryPixels(x, y, model.level(x, y) + 1.0, each, each), model, np.zeros(x.size)).pull
     for k in range(slopes.shape[0]):
         step = np.zeros(slopes.shape[0])
         step[k] = 1e-5

@@ -11,7 +11,7 @@ import make_ideal_images as ideal
 from eyerender.base.status import Status
 from eyerender.extraction import extract
 from eyerender.extraction.glints import deblending, fitting, gaussian_model, windows
-from eyerender.extraction.glints.classification import Eye, compared, features
+from eyerender.extraction.glints.classification import EyeContext, compared, features
 from eyerender.extraction.glints.fits import SpotFit
 from eyerender.extraction.preprocessing import DN, Prepared, prepare
 from eyerender.optics.ellipse import Ellipse
@@ -103,7 +103,7 @@ def _place_of_a_spot(covered: slice, level: float) -> np.ndarray:
     )
     levels = {"pupil_dn": 30.0, "iris_dn": 100.0, "clip_dn": 250.0}
     ellipse = Ellipse(np.array([60.0, 60.0]), np.array([20.0, 20.0]), 0.0)
-    return features(fit, Eye(ellipse=ellipse, blur_px=1.0, support=1.0, linear=linear, **levels))[0, 6:8]
+    return features(fit, EyeContext(ellipse=ellipse, blur_px=1.0, support=1.0, linear=linear, **levels))[0, 6:8]
 
 
 def test_lashes_beside_a_spot_and_a_lid_before_it_speak_against_a_glint():

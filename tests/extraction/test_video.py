@@ -16,7 +16,7 @@ import make_ideal_images as ideal
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.extraction import REFINED, extract, extract_eyes
-from eyerender.extraction.video import SUFFIXES, Frame, VideoReader, VideoWriter, follow
+from eyerender.extraction.video import SUFFIXES, VideoFrame, VideoReader, VideoWriter, follow
 from eyerender.optics.ellipse import Ellipse, iou
 
 SEEDS = range(20_300, 20_306)
@@ -55,7 +55,7 @@ def test_a_followed_pupil_is_that_of_single_frames(drawings):
     # The pupil jumps by several of its sizes from frame to frame, and one frame shows none.
     images = [drawing.image for drawing in drawings]
     images.insert(3, np.full_like(images[0], 120) + np.arange(320, dtype=np.uint8) // 8)
-    frames = (Frame(k, k / 50.0, image, False) for k, image in enumerate(images))
+    frames = (VideoFrame(k, k / 50.0, image, False) for k, image in enumerate(images))
     for frame, (found,) in follow(frames, settings=REFINED):
         single = extract(frame.image, settings=REFINED).pupil
         assert found.pupil.ok == single.ok

@@ -9,7 +9,7 @@ import pytest
 
 import eyerender as er
 from eyerender.apps.rigs.report import estimator_errors
-from eyerender.design.people import Survey
+from eyerender.design.people import RigPopulation
 from eyerender.gaze.store import choose_estimator, load_estimator, save_estimator
 
 
@@ -63,7 +63,7 @@ def test_what_it_cannot_do_is_named(seen):
 @pytest.mark.parametrize("rig", ["headset", "desktop_tracker"])
 def test_it_has_the_smallest_error_on_exact_features_of_drawn_people(rig):
     """Median person's 95th percentile, calibrated on nine targets; people differ from each other by a factor of two."""
-    survey = Survey(
+    survey = RigPopulation(
         scene=er.load_scene(rig).spec.to_mapping(),
         population={"preset": "adults"},
         seed=1,

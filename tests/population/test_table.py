@@ -10,7 +10,7 @@ from eyerender.base.errors import InputError
 from eyerender.population.correlation import completed, nearest_correlation
 from eyerender.population.marginals import Lognormal, Mixture, Normal, Part, Uniform
 from eyerender.population.model import Model, Reference, default_reference
-from eyerender.population.table import Table, default_table
+from eyerender.population.table import PopulationTable, default_table
 
 
 def test_every_number_is_marked():
@@ -98,7 +98,7 @@ def changed(**parts):
         for key in keys[:-1]:
             node = node[key]
         node[keys[-1]] = value
-    return Table.from_mapping(data)
+    return PopulationTable.from_mapping(data)
 
 
 def test_a_spread_below_what_is_explained_is_refused():

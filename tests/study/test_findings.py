@@ -8,7 +8,7 @@ from scipy import stats
 
 from eyerender.apps.study import featureclouds, findings
 from eyerender.apps.study import literature as lit
-from eyerender.apps.study.blignaut import Outcome
+from eyerender.apps.study.blignaut import FunctionErrors
 
 
 def of(found, name):
@@ -56,7 +56,7 @@ def outcomes(scale=1.0, late=0.05, order=("R8",)):
             if c == "C135":
                 value = 0.05 * scale
             for f in lit.BLIGNAUT_DEG:
-                rows.append(Outcome(f, c, np.full(135, value if f == best else value + 0.3), None))
+                rows.append(FunctionErrors(f, c, np.full(135, value if f == best else value + 0.3), None))
         out[model] = rows
     return out
 
@@ -89,7 +89,7 @@ def test_models_that_differ_are_told():
     spread = 0.01 * rng.normal(size=135)
     moved = {"E1": 0.0, "E2": 0.0, "E3": 0.02, "E4": 0.0, "E5": 0.05}
     many = {
-        m: [Outcome(o.function, o.calibration, o.error_deg + spread + moved[m], None) for o in rows]
+        m: [FunctionErrors(o.function, o.calibration, o.error_deg + spread + moved[m], None) for o in rows]
         for m, rows in outcomes().items()
     }
     found = findings.blignaut(many, "c", "a")
@@ -98,7 +98,9 @@ def test_models_that_differ_are_told():
     assert of(found, "B9")[0].verdict is False
     assert of(found, "B9")[0].value < 1e-6
     assert of(found, "B10")[0].value == pytest.approx(0.05)
-    same = {m: [Outcome(o.function, o.calibration, 0.1 + spread, None) for o in rows] for m, rows in many.items()}
+    same = {
+        m: [FunctionErrors(o.function, o.calibration, 0.1 + spread, None) for o in rows] for m, rows in many.items()
+    }
     assert of(findings.blignaut(same, "c", "a"), "B9")[0].verdict is True
 
 
@@ -118,7 +120,7 @@ def test_ties_count_as_equally_good():
     for model, rows in many.items():
         kept = [o for o in rows if (o.function, o.calibration) != ("R7", "C14")]
         # By half a thousandth of a degree better than R8, which has 0.05.
-        many[model] = [*kept, Outcome("R7", "C14", np.full(135, 0.0495), None)]
+        many[model] = [*kept, FunctionErrors("R7", "C14", np.full(135, 0.0495), None)]
     found = next(f for f in of(findings.blignaut(many, "c", "a"), "B1") if f.rule.startswith("C14"))
     assert found.verdict is True
     assert "R7 = R8" in found.detail

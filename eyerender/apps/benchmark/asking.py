@@ -24,7 +24,7 @@ _OWN = "eyerender.apps.benchmark.shipped:own_"
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class ExtractorResults:
     """Results of one extractor: its greeting (None if it never came), and a score per image."""
 
     extractor: ExtractorCommand
@@ -48,7 +48,7 @@ def ask_extractors(
     *,
     answers: Answers | None = None,
     step: Callable[[str], None] = lambda _name: None,
-) -> list[Run]:
+) -> list[ExtractorResults]:
     """Run every extractor on every image; the scores include every failure.
 
     The images of an extractor are divided among `options.jobs` processes. The results do not depend on their number.
@@ -125,7 +125,7 @@ class _Asker:
         for process in processes:
             process.close()
 
-    def run(self) -> Run:
+    def run(self) -> ExtractorResults:
         """Score all answers; images after `PATIENCE` consecutive failures count as not processed."""
         greeting = self._greeting
         reports = greeting.reports if greeting else ()
@@ -142,7 +142,7 @@ class _Asker:
                 continue
             failures = 0
             scores.append(score(image, answer.reply, answer.trip_s, reports))
-        return Run(self._extractor, greeting, tuple(scores))
+        return ExtractorResults(self._extractor, greeting, tuple(scores))
 
     def _answer(self, row: int, process: ExtractorProcess | None) -> tuple[_Answer, ExtractorProcess | None]:
         """Return the answer for one image, stored or new, and the process to use next."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .asking import Run
+from .asking import ExtractorResults
 from .intervals import mcnemar
 from .score import Score
 from .summary import sizes
@@ -19,7 +19,7 @@ def is_success(score: Score) -> bool:
     return score.outcome in ("right", "absent")
 
 
-def pairs_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def pairs_of(runs: Sequence[ExtractorResults]) -> list[dict[str, Any]]:
     """Compare every two extractors: successes of only one of them, and errors on the pupils that both detect.
 
     `p` is that of the exact McNemar test. It is not corrected for the number of pairs.
@@ -45,7 +45,7 @@ def pairs_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
     return out
 
 
-def common_errors(runs: Sequence[Run]) -> dict[str, Any]:
+def common_errors(runs: Sequence[ExtractorResults]) -> dict[str, Any]:
     """Return errors on the pupils that all extractors detect, among extractors that detect any."""
     some = [run for run in runs if any(s.outcome == "right" for s in run.scores)]
     rows = [k for k in range(len(some[0].scores)) if all(r.scores[k].outcome == "right" for r in some)] if some else []

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...backends.probe import cpu_name
-from .asking import Run
+from .asking import ExtractorResults
 from .curves import curves_of
 from .labelled import BenchImage
 from .score import Score
@@ -32,7 +32,7 @@ _LEAST_FOR_ORIGIN = 8
 _EDGE_COLUMNS = ("edge_arc_deg", "edge_step_error", "edge_width_error")
 
 
-def entry_of(run: Run) -> dict[str, Any]:
+def entry_of(run: ExtractorResults) -> dict[str, Any]:
     """Return the results of one extractor."""
     greeting = run.greeting
     return {
@@ -53,7 +53,7 @@ def entry_of(run: Run) -> dict[str, Any]:
     }
 
 
-def suggested_origin(run: Run) -> dict[str, str] | None:
+def suggested_origin(run: ExtractorResults) -> dict[str, str] | None:
     """Return the pixel origin that an extractor's results suggest, if it declares the other one.
 
     With the wrong origin, the centres of right pupils are off by half a pixel on both axes. The mean offset must lie
@@ -72,7 +72,7 @@ def suggested_origin(run: Run) -> dict[str, str] | None:
     return {"declared": declared, "suggested": other, "text": _ORIGIN.format(other, declared)}
 
 
-def row_of(run: Run, s: Score) -> dict[str, Any]:
+def row_of(run: ExtractorResults, s: Score) -> dict[str, Any]:
     """Return one line of results.csv: the answer of an extractor for an image."""
     dx, dy = s.offset_px or (None, None)
     da, db = s.axes_px or (None, None)
@@ -104,7 +104,7 @@ def row_of(run: Run, s: Score) -> dict[str, Any]:
     }
 
 
-def times_of(runs: Sequence[Run]) -> dict[str, Any]:
+def times_of(runs: Sequence[ExtractorResults]) -> dict[str, Any]:
     """Return the content of times.json: the machine, and each extractor's times in total and per image, in ms."""
     return {
         "schema": TIMES_SCHEMA,

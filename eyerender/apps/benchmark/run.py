@@ -16,7 +16,7 @@ from ...base.storage.lock import LOCK
 from ...folders.imagefolder import STAGE, versions
 from ...folders.outfolder import MARKER, refuse_non_empty, staged
 from .answers import ANSWERS, Answers, code_digest, image_key, task_of
-from .asking import Run, ask_extractors
+from .asking import ExtractorResults, ask_extractors
 from .checks import RESULTS_SCHEMA, Requirement, compare_with, problems_of, read_results
 from .conditions import CONDITIONS, balanced
 from .failurekinds import KINDS, kind_of
@@ -119,7 +119,9 @@ def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[E
     return chosen, absent
 
 
-def _results(folder: Path, runs: Sequence[Run], images: Sequence[BenchImage], keys: Sequence[str]) -> dict[str, Any]:
+def _results(
+    folder: Path, runs: Sequence[ExtractorResults], images: Sequence[BenchImage], keys: Sequence[str]
+) -> dict[str, Any]:
     """Return the content of results.json without its checks."""
     return {
         "schema": RESULTS_SCHEMA,
@@ -143,7 +145,7 @@ def _results(folder: Path, runs: Sequence[Run], images: Sequence[BenchImage], ke
     }
 
 
-def _classified(run: Run, images: Sequence[BenchImage]) -> Run:
+def _classified(run: ExtractorResults, images: Sequence[BenchImage]) -> ExtractorResults:
     """Add to every wrong ellipse the kind of object that it shows."""
     scores = []
     for s, image in zip(run.scores, images, strict=True):
@@ -153,7 +155,7 @@ def _classified(run: Run, images: Sequence[BenchImage]) -> Run:
     return replace(run, scores=tuple(scores))
 
 
-def _thumbnails(run: Run, images: Sequence[BenchImage]) -> list[Thumbnail]:
+def _thumbnails(run: ExtractorResults, images: Sequence[BenchImage]) -> list[Thumbnail]:
     """Return crops of the first images of every kind of failure, the most frequent kinds first."""
     named, out = {image.name: image for image in images}, []
     for (outcome, reason), scores in sorted(failures_by_kind(run.scores).items(), key=lambda item: -len(item[1])):

@@ -23,7 +23,7 @@ _FLAT = 1.0  # least spread of a thumbnail's levels, of 255
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class SimilarPair:
     """Two images, by their places, and the correlation of their thumbnails; 1 where their pixels are equal."""
 
     first: int
@@ -40,7 +40,7 @@ def equal_pictures(digests: Sequence[bytes]) -> list[list[int]]:
     return sorted((group for group in groups.values() if len(group) > 1), key=lambda group: (-len(group), group[0]))
 
 
-def near_duplicates(thumbnails: Bytes, digests: Sequence[bytes]) -> list[Pair]:
+def near_duplicates(thumbnails: Bytes, digests: Sequence[bytes]) -> list[SimilarPair]:
     """Pairs of pictures that differ, with thumbnails that hardly do; the most alike come first.
 
     Args:
@@ -64,7 +64,7 @@ def near_duplicates(thumbnails: Bytes, digests: Sequence[bytes]) -> list[Pair]:
         for b in row[row < len(places)]:
             if a != b and float(unit[a] @ unit[b]) >= CORRELATION:
                 pairs.add((min(a, int(b)), max(a, int(b))))
-    found = [Pair(int(places[a]), int(places[b]), float(unit[a] @ unit[b])) for a, b in pairs]
+    found = [SimilarPair(int(places[a]), int(places[b]), float(unit[a] @ unit[b])) for a, b in pairs]
     return sorted(found, key=lambda pair: (-pair.correlation, pair.first, pair.second))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
-from .duplicates import Pair
+from .duplicates import SimilarPair
 from .faults import KINDS
 from .outliers import Outlier
 from .reading import Contents
@@ -39,7 +39,7 @@ class Inspection:
     splits: dict[str, tuple[int, set[int]]]
     shared: dict[int, list[str]]
     equal: list[list[int]]
-    near: list[Pair]
+    near: list[SimilarPair]
     outliers: list[Outlier]
     distributions: dict[str, Distribution]
     correlated: tuple[list[str], Floats]

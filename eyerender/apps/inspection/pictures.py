@@ -29,7 +29,7 @@ _MEAN = f"{PICTURE}mean level"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
+class PictureSummary:
     """What is kept of a picture.
 
     Attributes:
@@ -47,10 +47,12 @@ class Picture:
     faults: list[Fault]
 
 
-def measure(entry: ImageEntry) -> Picture:
+def measure(entry: ImageEntry) -> PictureSummary:
     """Read an image and its mask."""
     faults: list[Fault] = []
-    nothing = Picture(numbers={}, thumbnail=np.zeros((SIDE, SIDE), np.uint8), digest=b"", mask=None, faults=faults)
+    nothing = PictureSummary(
+        numbers={}, thumbnail=np.zeros((SIDE, SIDE), np.uint8), digest=b"", mask=None, faults=faults
+    )
     try:
         found = entry.picture("file_name")
     except InputError as error:
@@ -69,7 +71,7 @@ def measure(entry: ImageEntry) -> Picture:
     if mask is not None:
         numbers |= _levels_of_parts(codes, mask, numbers[_MEAN])
     digest = hashlib.blake2b(np.ascontiguousarray(image).tobytes(), digest_size=8).digest()
-    return Picture(numbers=numbers, thumbnail=thumbnail, digest=digest, mask=mask, faults=faults)
+    return PictureSummary(numbers=numbers, thumbnail=thumbnail, digest=digest, mask=mask, faults=faults)
 
 
 def eight_bits(image: NDArray[Any], bit_depth: int) -> Bytes:

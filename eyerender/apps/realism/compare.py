@@ -13,7 +13,7 @@ from ...base.errors import InputError
 from ...base.progress import Progress, followed
 from ...folders.exported import EXPORT, exported_gamma
 from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
-from .folder import FolderFigures, Skipped, Source, open_source, pictures
+from .folder import FolderFigures, PictureFolder, Skipped, open_source, pictures
 from .patches import patches
 from .separability import MISSING, available, separability, to_mapping
 
@@ -70,7 +70,7 @@ def measure_folder(
     )
 
 
-def _encoding(source: Source) -> tuple[float, str]:
+def _encoding(source: PictureFolder) -> tuple[float, str]:
     """Return the gamma of a folder's images, and its source."""
     if source.entries:
         return source.entries[0].gamma, "the folder"

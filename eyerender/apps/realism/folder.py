@@ -39,7 +39,7 @@ class Skipped:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class PictureFolder:
     """A folder of pictures.
 
     Attributes:
@@ -114,7 +114,7 @@ def _summary(values: Sequence[float]) -> dict[str, float | int | None]:
     return {"n": len(values), **dict(zip(names, found, strict=True))}
 
 
-def open_source(path: str | Path, limit: int) -> Source:
+def open_source(path: str | Path, limit: int) -> PictureFolder:
     """Open a folder and select `limit` of its images, spread evenly.
 
     Raises:
@@ -126,16 +126,16 @@ def open_source(path: str | Path, limit: int) -> Source:
     if (folder / METADATA).is_file():
         entries = ImageFolder.load(folder).entries
         chosen = tuple(entries[i] for i in _spread(len(entries), limit))
-        return Source(folder, tuple(entry.name for entry in chosen), chosen)
+        return PictureFolder(folder, tuple(entry.name for entry in chosen), chosen)
     found = image_files(folder)
-    return Source(folder, tuple(found[i] for i in _spread(len(found), limit)))
+    return PictureFolder(folder, tuple(found[i] for i in _spread(len(found), limit)))
 
 
 def _spread(count: int, limit: int) -> list[int]:
     return [k * count // min(count, limit) for k in range(min(count, limit))]
 
 
-def pictures(source: Source, gamma: float) -> Iterator[EyePicture | Skipped]:
+def pictures(source: PictureFolder, gamma: float) -> Iterator[EyePicture | Skipped]:
     """Yield each image of a source with its landmarks, or the reason why it cannot be measured.
 
     Args:

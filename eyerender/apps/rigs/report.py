@@ -22,7 +22,7 @@ from ...base.progress import Progress, notify
 from ...base.storage.files import write_json
 from ...design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
-from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, Survey, place_of
+from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, place_of
 from ...design.safety import NOTE, eye_exposure
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import staged
@@ -83,7 +83,7 @@ def run_rig(
     Raises:
         InputError: the folder is not empty, or no drawn eye is physically possible.
     """
-    survey = Survey(
+    survey = RigPopulation(
         scene=scene.located().to_mapping(),
         population=population.to_mapping(),
         seed=size.seed,
@@ -114,7 +114,7 @@ def run_rig(
 
 
 def estimator_errors(
-    survey: Survey,
+    survey: RigPopulation,
     subjects: Sequence[int],
     progress: Progress | None = None,
     *,
@@ -163,7 +163,7 @@ def _taken(rays: Any, rows: Any) -> Any:
     return type(rays)(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows])
 
 
-def _scene_of(survey: Survey, subject: int, cells: Ints) -> Scene:
+def _scene_of(survey: RigPopulation, subject: int, cells: Ints) -> Scene:
     """Build the scene of a person who looks at targets a metre away in the directions `cells` of the 81."""
     spec = SceneSpec.from_mapping(survey.scene)
     person = Population.from_mapping(survey.population).person(subject, survey.seed)
@@ -184,7 +184,7 @@ def _scene_of(survey: Survey, subject: int, cells: Ints) -> Scene:
 
 
 def summary(
-    scene: Scene, survey: Survey, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
+    scene: Scene, survey: RigPopulation, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
 ) -> dict[str, Any]:
     """Return the content of summary.json."""
     side = scene.spec.subject.eyes[0]
@@ -252,7 +252,7 @@ def _write_people(path: Path, found: Figures) -> None:
             writer.writerow([subject, *(f"{value:.6g}" for value in (*e95, *means))])
 
 
-def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
+def _write_gaze(path: Path, survey: RigPopulation, found: Figures) -> None:
     """Write one row per direction."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -266,7 +266,7 @@ def _write_gaze(path: Path, survey: Survey, found: Figures) -> None:
             writer.writerow([f"{value:.6g}" for value in (*direction, *values)])
 
 
-def page_of(scene: Scene, survey: Survey, found: Figures, data: dict[str, Any]) -> Page:
+def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str, Any]) -> Page:
     """Compose the report's page."""
     share, cornea = data["coverage"]["outline_and_2_glints"], data["safety"].get("cornea_share")
     cards = [
@@ -312,7 +312,7 @@ def _answer(data: dict[str, Any]) -> str:
     return " ".join(parts)
 
 
-def _gaze_section(survey: Survey, found: Figures) -> Section:
+def _gaze_section(survey: RigPopulation, found: Figures) -> Section:
     covered = (found.outline >= OUTLINE) & (found.glints >= 2)
     most = max(int(found.glints.max()), 1)
     maps = (
@@ -332,7 +332,7 @@ def _gaze_section(survey: Survey, found: Figures) -> Section:
     return Section("Where does the rig see well?", *drawn)
 
 
-def _who_section(survey: Survey, found: Figures, data: dict[str, Any]) -> Section:
+def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) -> Section:
     covered = ((found.outline >= OUTLINE) & (found.glints >= 2)).mean(axis=1)
     noise = np.quantile(found.noise_deg, 0.95, axis=1, method="higher")
     worst = np.lexsort((-noise, covered))[:10]

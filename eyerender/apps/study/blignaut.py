@@ -60,7 +60,7 @@ CORRECTED: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FunctionErrors:
     """Errors of one function and calibration set: `error_deg` (f,) by frame, or the reason why there are none.
 
     `vector_deg` (f, 2) are the same errors to the right and up.
@@ -111,7 +111,7 @@ def terms(function: str, departures: Collection[str]) -> tuple[str, str]:
 
 def run(
     observations: Observations, rig: RigGeometry, departures: Collection[str], *, centred: bool = False
-) -> list[Outcome]:
+) -> list[FunctionErrors]:
     """Calibrate every function on every set and test it on all targets; `centred` is as in `Regression`."""
     out = []
     fixation = observations.index.fixation
@@ -124,7 +124,7 @@ def run(
                 with undetermined_to(None, ""):  # the paper tests such functions, too
                     fitted = regression.fit(calibration, rig)
             except InputError as error:
-                out.append(Outcome(function, name, np.zeros(0), str(error)))
+                out.append(FunctionErrors(function, name, np.zeros(0), str(error)))
                 continue
             frames, gaze = binocular_average(observations, fitted.predict(observations, rig))
             index = frames.index
@@ -134,18 +134,20 @@ def run(
                 eye = eye + rig.screen.centre_mm * np.array([0.0, 1.0, 1.0])
             errors = angular_error_deg(gaze.point_mm, index.target_mm, eye)
             out.append(
-                Outcome(function, name, errors, None, error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye))
+                FunctionErrors(
+                    function, name, errors, None, error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye)
+                )
             )
     return out
 
 
-def best(outcomes: list[Outcome], calibration: str) -> Outcome | None:
+def best(outcomes: list[FunctionErrors], calibration: str) -> FunctionErrors | None:
     """Return the function with the smallest mean error for a set; None if there is none."""
     some = [o for o in outcomes if o.calibration == calibration and o.mean_deg is not None]
     return min(some, key=lambda o: o.mean_deg or 0.0) if some else None
 
 
-def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
+def rows_of(outcomes: list[FunctionErrors], **keys: Any) -> list[Row]:
     """Return one row per function and set."""
     keys["eye"] = "both"
     return [
@@ -156,7 +158,7 @@ def rows_of(outcomes: list[Outcome], **keys: Any) -> list[Row]:
     ]
 
 
-def _solution(outcome: Outcome) -> str | None:
+def _solution(outcome: FunctionErrors) -> str | None:
     if outcome.reason is not None:
         return None
     need = max(len(FUNCTIONS[outcome.function][k].split("+")) for k in (0, 1))

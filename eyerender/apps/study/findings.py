@@ -11,7 +11,7 @@ from scipy.stats import ttest_1samp, ttest_ind, ttest_rel
 from ...base.arrays import Floats
 from ...gaze.regression import FUNCTIONS
 from . import literature as lit
-from .blignaut import Outcome, best
+from .blignaut import FunctionErrors, best
 from .results import Finding
 
 _ALPHA = 0.05
@@ -117,7 +117,7 @@ def guestrin(
     return out
 
 
-def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str) -> list[Finding]:
+def blignaut(outcomes: Mapping[str, list[FunctionErrors]], protocol: str, observer: str) -> list[Finding]:
     """Test findings B1 to B11, by eye model."""
     tested = _Blignaut(outcomes, protocol, observer)
     tests = (_best_functions, _drops, _spherical, _shares, _five_targets, _alike, _deviations)
@@ -127,7 +127,7 @@ def blignaut(outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str
 class _Blignaut:
     """Best functions and mean errors (deg) by eye model and calibration set."""
 
-    def __init__(self, outcomes: Mapping[str, list[Outcome]], protocol: str, observer: str) -> None:
+    def __init__(self, outcomes: Mapping[str, list[FunctionErrors]], protocol: str, observer: str) -> None:
         self.outcomes, self.protocol, self.observer = outcomes, protocol, observer
         self.best = {m: {c: best(o, c) for c in lit.CALIBRATION_SETS} for m, o in outcomes.items()}
         self.error = {m: {c: _mean(b) for c, b in found.items()} for m, found in self.best.items()}
@@ -156,7 +156,7 @@ _SETS = tuple(lit.CALIBRATION_SETS.items())
 NEGLIGIBLE_DEG, ALIKE_DEG, ACCEPTABLE_DEG = 0.01, 0.05, 1.0
 
 
-def _mean(outcome: Outcome | None) -> float:
+def _mean(outcome: FunctionErrors | None) -> float:
     return (outcome.mean_deg if outcome else None) or np.nan
 
 
@@ -266,13 +266,13 @@ def _deviations(b: _Blignaut) -> Iterator[Finding]:
     yield b.finding("B11", rule, least, ">= 0.40", least >= 0.40 and least == min(off["C135"]), detail)
 
 
-def _p(one: Outcome | None, other: Outcome | None) -> float:
+def _p(one: FunctionErrors | None, other: FunctionErrors | None) -> float:
     if one is None or other is None:
         return np.nan
     return float(ttest_ind(one.error_deg, other.error_deg, nan_policy="omit").pvalue)
 
 
-def _ties(outcomes: Sequence[Outcome], calibration: str) -> list[str]:
+def _ties(outcomes: Sequence[FunctionErrors], calibration: str) -> list[str]:
     """Return the functions that are as good as the best one for a set, the best first."""
     some = sorted((o.mean_deg, o.function) for o in outcomes if o.calibration == calibration and o.mean_deg is not None)
     return [name for mean, name in some if mean - some[0][0] < _TIE_DEG]

@@ -103,7 +103,7 @@ SOFTWARE_BOUNDS = ParameterBounds(
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CalibrationErrors:
     """One calibration at H1 and its errors: `error_deg` (n,) by observation, `head` (n,) 0 for H1.
 
     `vector_deg` (n, 2) are the errors to the right and up at the eye; `error_deg` uses the protocol's own measure.
@@ -192,7 +192,7 @@ def errors_deg(observations: Observations, gaze: GazePoints, departures: Collect
 
 def run(
     observations: Observations, rig: RigGeometry, departures: Collection[str], *, free_index: bool = False
-) -> Outcome:
+) -> CalibrationErrors:
     """Calibrate at H1 and estimate at all head positions."""
     told = estimation_rig(rig, departures)
     central = observations.take(observations.index.head == 0)
@@ -201,10 +201,10 @@ def run(
     index = observations.index
     eye = index.eye_position_mm + index.head_mm
     vectors = error_vectors_deg(gaze.point_mm - eye, index.target_mm - eye)
-    return Outcome(observations, gaze, errors_deg(observations, gaze, departures), vectors, fitted)
+    return CalibrationErrors(observations, gaze, errors_deg(observations, gaze, departures), vectors, fitted)
 
 
-def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:
+def rows_of(outcome: CalibrationErrors, **keys: Any) -> list[Row]:
     """Return rows of H1 and H2 for each eye, and pooled if there are two."""
     index, pupil, glints = outcome.observations.index, outcome.observations.pupil, outcome.observations.glints
     inside = pupil.in_image & glints.in_image.all(axis=1)
@@ -219,7 +219,7 @@ def rows_of(outcome: Outcome, **keys: Any) -> list[Row]:
 
 
 def restarts(
-    outcome: Outcome, rig: RigGeometry, departures: Collection[str], *, starts: int = STARTS
+    outcome: CalibrationErrors, rig: RigGeometry, departures: Collection[str], *, starts: int = STARTS
 ) -> dict[str, Any]:
     """Calibrate the right eye from random starts within the bounds.
 

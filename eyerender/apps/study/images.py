@@ -38,7 +38,7 @@ _PATIENCE_S = 60.0  # per image, after which a silent worker counts as dead
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class EyeShot:
     """A scene whose images form one sample, and the rows (n,) of the study's scene that they show."""
 
     scene: Scene
@@ -83,7 +83,7 @@ class StudyImages:
         return ImageObserver().observe_entries(self.of(scene), scene.index(), scene, exposed=again)
 
 
-def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[Shot]:
+def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[EyeShot]:
     """Create one shot per eye; with `facing`, one per eye and head position, with the cameras turned to the eye."""
     data = scene.spec.with_image(spp=spp).to_mapping()
     data["sensor"]["noise"] = noise
@@ -97,7 +97,7 @@ def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = 
             if head is not None:
                 rows = rows & (index.head == head)
                 one = facing_scene(one, heads[head], side)
-            out.append(Shot(one, frozen(np.flatnonzero(rows), np.int64)))
+            out.append(EyeShot(one, frozen(np.flatnonzero(rows), np.int64)))
     return out
 
 

@@ -23,7 +23,7 @@ from ...optics.ellipse import fit_ellipse_direct, points_on_ellipse
 from ...rig.camera import PinholeCamera
 from ...scene import Scene
 from ...scene.observation import Observations, concatenate
-from .images import Shot, StudyImages, shots
+from .images import EyeShot, StudyImages, shots
 
 OUTLINE_POINTS = 64
 ObserverKind = Literal["analytic", "image", "image-noiseless"]
@@ -65,7 +65,7 @@ class Observing:
             order.append(shot.rows)
         return concatenate(parts).take(np.argsort(np.concatenate(order)))
 
-    def shots(self, scene: Scene, *, facing: bool = False, spp: int | None = None) -> list[Shot]:
+    def shots(self, scene: Scene, *, facing: bool = False, spp: int | None = None) -> list[EyeShot]:
         """Return the shots that this observer needs of a scene; none for ray optics."""
         return [] if self.kind == "analytic" else shots(scene, noise=self.kind == "image", facing=facing, spp=spp)
 

@@ -21,7 +21,7 @@ from ...base.storage.files import csv_text, write_json, write_text
 from ...design.choice import SiteInformation, choose_lights, noise_of_some
 from ...design.crowd import OUTLINE, coverage_of, figures_of_people, users_of
 from ...design.noise import sensor_noise
-from ...design.people import GRID, LOST, Figures, Survey, sites_seen
+from ...design.people import GRID, LOST, Figures, RigPopulation, sites_seen
 from ...design.safety import eye_exposure
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import staged
@@ -115,7 +115,7 @@ def run_rigs(
 
 def _result(layout: KnownLayout, people: int, workers: int | None, progress: Progress | None) -> RigResult:
     scene = Scene.of(SceneSpec.from_mapping(layout.scene))
-    survey = Survey(
+    survey = RigPopulation(
         scene=layout.scene,
         population=Population("adults").to_mapping(),
         slippage_mm=layout.slippage_mm,
@@ -135,7 +135,7 @@ def _result(layout: KnownLayout, people: int, workers: int | None, progress: Pro
     )
 
 
-def bought(survey: Survey, scene: Scene, people: int) -> list[dict[str, Any]]:
+def bought(survey: RigPopulation, scene: Scene, people: int) -> list[dict[str, Any]]:
     """Compute the noise of the optic axis for a known person, and the glints, with the best 1, 2, ... LEDs."""
     known_person = replace(survey, unknowns=Unknowns(slippage_mm=max(3.0, survey.slippage_mm)).to_mapping())
     counts = range(1, len(scene.rig.lights) + 1)

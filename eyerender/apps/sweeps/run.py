@@ -28,14 +28,14 @@ from ...base.storage.lock import final_lock, run_lock
 from ...design.choice import choose_lights, noise_of_some
 from ...design.crowd import coverage_of, users_of
 from ...design.noise import sensor_noise
-from ...design.people import Survey, figures_of, sites_seen
+from ...design.people import RigPopulation, figures_of, sites_seen
 from ...design.safety import eye_exposure
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import clear, refuse_non_empty
 from ...scene import Scene
 from ...scene.spec import SceneSpec
 from .page import write_report
-from .spec import Layout, SweepSpec, layouts_of
+from .spec import RigLayout, SweepSpec, layouts_of
 
 SCHEMA, LAYOUT_SCHEMA = "eyerender/sweep/1", "eyerender/sweep-layout/1"
 MARKER, SUMMARY, TABLE, LAYOUTS, REPORT = "sweep.json", "summary.json", "layouts.csv", "layouts", "report.html"
@@ -136,7 +136,9 @@ def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
         raise EyerenderError(f"{folder}: cannot be written ({error.strerror or error})") from None
 
 
-def _evaluated(spec: SweepSpec, layouts: Sequence[Layout], workers: int | None) -> Iterator[tuple[int, dict[str, Any]]]:
+def _evaluated(
+    spec: SweepSpec, layouts: Sequence[RigLayout], workers: int | None
+) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield results of layouts as worker processes finish them."""
     count = min(workers or os.cpu_count() or 1, len(layouts))
     if count <= 1:
@@ -157,7 +159,7 @@ def _evaluated(spec: SweepSpec, layouts: Sequence[Layout], workers: int | None) 
             start(len(ready))
 
 
-def evaluate(spec: SweepSpec, layout: Layout) -> dict[str, Any]:
+def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
     """Evaluate one layout: choose its LEDs, and compute bound, dropout and exposure over the population."""
     survey = _survey(spec, layout.scene)
     scene = Scene.of(SceneSpec.from_mapping(layout.scene))
@@ -188,8 +190,8 @@ def evaluate(spec: SweepSpec, layout: Layout) -> dict[str, Any]:
     }
 
 
-def _survey(spec: SweepSpec, scene: Mapping[str, Any]) -> Survey:
-    return Survey(
+def _survey(spec: SweepSpec, scene: Mapping[str, Any]) -> RigPopulation:
+    return RigPopulation(
         scene=scene,
         population=spec.people_of().to_mapping(),
         seed=spec.seed,
@@ -221,7 +223,7 @@ def pareto(rows: Sequence[Mapping[str, Any]]) -> Bools:
     return ~beaten
 
 
-def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[Layout]) -> dict[str, Any]:
+def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[RigLayout]) -> dict[str, Any]:
     """Read all layouts and write the results."""
     rows = [_read(_path(folder, layout.number), layout.number) for layout in layouts]
     front = pareto(rows)

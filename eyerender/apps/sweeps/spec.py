@@ -23,7 +23,7 @@ MAX_LAYOUTS = 100_000
 LightCount = Annotated[int, Field(ge=1, le=MAX_LIGHTS)]
 
 
-class Places(Spec):
+class SweptPlaces(Spec):
     """Positions in the world: a list, a curve, or a surface."""
 
     points_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = Field(default=None, description="a list")
@@ -69,7 +69,7 @@ class SweptCamera(Spec):
     """Values of one camera to vary."""
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="number of the camera in the scene")
-    places: Places | None = Field(
+    places: SweptPlaces | None = Field(
         default=None, description="positions of the camera, which keeps its target or direction"
     )
     focal_length_px: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = Field(
@@ -83,7 +83,7 @@ class SweptCamera(Spec):
 class SweptLights(Spec):
     """LEDs that replace those of the scene; all but position and intensity is copied from the scene's first LED."""
 
-    places: Places = Field(description="positions of LEDs, or those from which `number` chooses")
+    places: SweptPlaces = Field(description="positions of LEDs, or those from which `number` chooses")
     number: Annotated[tuple[LightCount, ...], Field(min_length=1)] | None = Field(
         default=None, description="numbers of LEDs, at the best of the positions; default: all of them"
     )
@@ -128,7 +128,7 @@ class SweepSpec(FileSpec):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class RigLayout:
     """One layout of a sweep.
 
     Attributes:
@@ -144,7 +144,7 @@ class Layout:
     lights: int
 
 
-def layouts_of(spec: SweepSpec, scene: Scene) -> list[Layout]:
+def layouts_of(spec: SweepSpec, scene: Scene) -> list[RigLayout]:
     """Return all layouts of a sweep, each validated.
 
     Raises:
@@ -162,7 +162,7 @@ def layouts_of(spec: SweepSpec, scene: Scene) -> list[Layout]:
         SceneSpec.from_mapping(data, source=f"layout {number}").rig.build()
         leds = (led["ring"]["count"] if led.get("ring") else 1 for led in data["rig"]["lights"])
         lights = chosen.get("number") or sum(leds)
-        found.append(Layout(number=number, values=chosen, scene=data, lights=lights))
+        found.append(RigLayout(number=number, values=chosen, scene=data, lights=lights))
     return found
 
 

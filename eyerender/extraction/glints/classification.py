@@ -57,7 +57,7 @@ FIRST, SECOND = glint_weights()  # of the features, and of the comparison
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Eye:
+class EyeContext:
     """Properties of the eye by which spots are judged.
 
     Attributes:
@@ -95,7 +95,7 @@ class Eye:
 
 
 def classify_spots(
-    fit: SpotFit, patches_px: Floats, eye: Eye, settings: ExtractionSettings
+    fit: SpotFit, patches_px: Floats, eye: EyeContext, settings: ExtractionSettings
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
     """Divide spots into (accepted, rejected), brightest first.
 
@@ -129,7 +129,7 @@ def classify_spots(
     return tuple(accepted[: settings.max_glints]), tuple(rejected + surplus + patches)
 
 
-def features(fit: SpotFit, eye: Eye) -> Floats:
+def features(fit: SpotFit, eye: EyeContext) -> Floats:
     """Compute the features (n, 10) of spots for the first logit.
 
     They are: how much the background is brighter than the pupil or iris expected there, in steps from pupil to iris;
@@ -160,7 +160,7 @@ def features(fit: SpotFit, eye: Eye) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def _surroundings(fit: SpotFit, beyond: Floats, eye: Eye) -> tuple[Floats, Floats]:
+def _surroundings(fit: SpotFit, beyond: Floats, eye: EyeContext) -> tuple[Floats, Floats]:
     """Compute how much darker than expected it is beside spots, and how much the level varies towards them, DN (n,).
 
     A glint lies before iris and pupil. Lashes beside a spot are darker than these, and between the pupil and a spot on
@@ -223,7 +223,7 @@ def _probability(logit: Floats) -> Floats:
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(logit, -30.0, 30.0))))
 
 
-def _objections(fit: SpotFit, eye: Eye) -> list[str | None]:
+def _objections(fit: SpotFit, eye: EyeContext) -> list[str | None]:
     """Return reasons (n,) why spots are not glints, None for glints."""
     reasons: list[str | None] = ["the spot's fit did not converge"] * fit.converged.size
     index = np.flatnonzero(fit.converged)

@@ -9,7 +9,7 @@ import numpy as np
 from ...base.arrays import Bools, Floats
 from ...base.jit import compiled
 from ...optics.ellipse import Ellipse
-from ..preprocessing import Image, Part, Prepared
+from ..preprocessing import Image, ImagePart, Prepared
 from ..pupil.glare import around
 from .detection import Spots
 from .fits import SpotFit
@@ -26,14 +26,14 @@ def well_fitted(prepared: Prepared, fit: SpotFit) -> Bools:
     return np.asarray(fit.converged & (fit.residual_dn < WELL_FITTED * prepared.noise_dn))
 
 
-def part_about(linear: Image, ellipse: Ellipse) -> Part:
+def part_about(linear: Image, ellipse: Ellipse) -> ImagePart:
     """Cut out the part that pixel model and boundary spots need, for boundaries up to 1.4 times as large."""
     reach = 1.4 * float(ellipse.semi_axes_px[0]) + LARGEST_PX + SPARE_PX
     columns, rows = around(ellipse.centre_px, reach, linear.shape)
-    return Part(np.ascontiguousarray(linear[rows, columns]), (columns.start, rows.start))
+    return ImagePart(np.ascontiguousarray(linear[rows, columns]), (columns.start, rows.start))
 
 
-def affected_pixels(prepared: Prepared, part: Part, spots: Spots, which: Bools | None = None) -> Bools:
+def affected_pixels(prepared: Prepared, part: ImagePart, spots: Spots, which: Bools | None = None) -> Bools:
     """Compute the mask (h, w) of a part's pixels affected by spots (`which`, or all), clutter or saturation.
 
     The extent of a spot follows from its detected height and width.
@@ -55,7 +55,9 @@ def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools
     return np.asarray(mask)
 
 
-def subtract_spots(part: Part, noise_dn: float, fit: SpotFit, which: Bools, about: Ellipse) -> tuple[Part, Bools]:
+def subtract_spots(
+    part: ImagePart, noise_dn: float, fit: SpotFit, which: Bools, about: Ellipse
+) -> tuple[ImagePart, Bools]:
     """Subtract the light of spots from the image in the neighbourhood of an ellipse.
 
     A fit describes the flanks of a spot far better than the circle of `affected_pixels`. Where the light exceeds three
@@ -77,7 +79,7 @@ def subtract_spots(part: Part, noise_dn: float, fit: SpotFit, which: Bools, abou
     spots = np.column_stack([fit.xy_px[near] - np.array(part.corner), sigma, height])
     radius = _reach(sigma.max(axis=1, initial=0.0), height, noise_dn) + 1.0
     linear, bright = _subtracted(part.linear, spots, radius, BRIGHT * noise_dn)
-    return Part(linear, part.corner), bright
+    return ImagePart(linear, part.corner), bright
 
 
 @compiled("f4[:,::1], f8[:,::1], f8[::1], f8")

@@ -12,7 +12,7 @@ from ...base.arrays import Bools
 from ...optics.ellipse import Ellipse, iou
 from ..preprocessing import Prepared
 from ..settings import Shape
-from .candidates import Candidate, Interior, candidate_at, inspect_interior
+from .candidates import BlobInterior, Candidate, candidate_at, inspect_interior
 from .consensus import BoundaryFit, fit_boundary
 from .edge_model import EdgeModel
 from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
@@ -44,11 +44,11 @@ class PupilCandidate:
         return EdgeModel(ellipse=self.boundary.ellipse, inner_dn=candidate.inside_dn, outer=outer, sigma_px=sigma)
 
     @cached_property
-    def interior(self) -> Interior:
+    def interior(self) -> BlobInterior:
         """Statistics of the pixels inside the boundary."""
         return self.inside(self.boundary.ellipse, self.model.sigma_px)
 
-    def inside(self, ellipse: Ellipse, blur_px: float) -> Interior:
+    def inside(self, ellipse: Ellipse, blur_px: float) -> BlobInterior:
         """Compute statistics of the pixels inside an ellipse around the blob."""
         return inspect_interior(self.inpainted, ellipse, blur_px, self.image.noise_dn)
 

@@ -360,7 +360,7 @@ def _same(first: Floats, second: Floats) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Interior:
+class BlobInterior:
     """Statistics of the pixels inside an ellipse.
 
     Attributes:
@@ -374,7 +374,7 @@ class Interior:
     spread_dn: float
 
 
-def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> Interior:
+def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> BlobInterior:
     """Compute statistics of the pixels inside an ellipse, up to where the blur of the boundary begins.
 
     The interior of a pupil is uniform. An iris has the pupil in its middle, and other objects have structure. Pixels
@@ -391,8 +391,8 @@ def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noi
     darker, core, ring, between = _interior(crop, hidden, about, end)
     spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
     if end < 0.6 or core < 5 or ring < 5:
-        return Interior(0.0, math.inf, spread)
-    return Interior(darker, 1.2533 * noise_dn * math.sqrt(1.0 / core + 1.0 / ring), spread)
+        return BlobInterior(0.0, math.inf, spread)
+    return BlobInterior(darker, 1.2533 * noise_dn * math.sqrt(1.0 / core + 1.0 / ring), spread)
 
 
 @compiled("f4[:,::1], b1[:,::1], UniTuple(f8, 5), f8")

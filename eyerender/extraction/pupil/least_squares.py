@@ -51,7 +51,7 @@ class Band:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pixels:
+class BoundaryPixels:
     """Pixels near the boundary, sorted by sector.
 
     Attributes:
@@ -69,12 +69,12 @@ class Pixels:
     sector: Indices
 
     @staticmethod
-    def of(band: Band, use: Bools, seen: Bools) -> Pixels:
+    def of(band: Band, use: Bools, seen: Bools) -> BoundaryPixels:
         """Select the pixels (n,) in `use` whose sector is one of those `seen` (SECTORS,)."""
         chosen = np.flatnonzero(use & seen[band.sector])
         chosen = chosen[np.argsort(band.sector[chosen], kind="stable")]
         sector, index = np.unique(band.sector[chosen], return_inverse=True)
-        return Pixels(band.x[chosen], band.y[chosen], band.level[chosen], index, sector)
+        return BoundaryPixels(band.x[chosen], band.y[chosen], band.level[chosen], index, sector)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,7 @@ class Sums:
     square: Floats
 
     @staticmethod
-    def of(pixels: Pixels, model: EdgeModel, displaced: Floats) -> Sums:
+    def of(pixels: BoundaryPixels, model: EdgeModel, displaced: Floats) -> Sums:
         """Compute the sums with sectors `displaced` (k,) px into the ellipse."""
         return Sums(*_pixel_sums(pixels.x, pixels.y, pixels.level, pixels.index, model.numbers(), displaced))
 
@@ -229,7 +229,7 @@ def _pixel_sums(
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Normal:
+class NormalEquations:
     """Normal equations with the sectors' displacements eliminated.
 
     Attributes:
@@ -249,7 +249,7 @@ class Normal:
     inverse: Floats
 
     @staticmethod
-    def of(sums: Sums, displaced: Floats, prior: Prior) -> Normal:
+    def of(sums: Sums, displaced: Floats, prior: Prior) -> NormalEquations:
         """Eliminate the displacements (k,) from the sums."""
         cost, rest, inverse = sums.cost, np.zeros(displaced.size), np.zeros(displaced.size)
         if not math.isinf(prior.displacement):
@@ -257,7 +257,7 @@ class Normal:
             rest = sums.along - prior.displacement * displaced
             cost += prior.displacement * float(displaced @ displaced)
         root = sums.across * np.sqrt(inverse)
-        return Normal(
+        return NormalEquations(
             matrix=sums.matrix - root @ root.T,
             vector=sums.pull.sum(axis=1) - sums.across @ (inverse * rest),
             cost=cost,
@@ -276,7 +276,7 @@ class Solution:
     sums: Sums
 
 
-def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
+def fitted(pixels: BoundaryPixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
     """Fit the model with at most `steps` damped Gauss-Newton steps (Levenberg).
 
     The cost is sum r^2 plus the priors. `displaced` (k,) is the start of the displacements.
@@ -285,7 +285,7 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
     held, damping = prior.of_all(numbers.size), 1e-4
     about = (pixels.x, pixels.y, pixels.level, pixels.index)
     sums = Sums(*_pixel_sums(*about, numbers, displaced))
-    normal = Normal.of(sums, displaced, prior)
+    normal = NormalEquations.of(sums, displaced, prior)
     cost = normal.cost + float(held @ numbers**2)
     for _ in range(steps):
         parts = (normal.matrix, normal.vector, normal.across, normal.along, normal.inverse)
@@ -295,7 +295,7 @@ def fitted(pixels: Pixels, model: EdgeModel, displaced: Floats, prior: Prior, st
             numbers, displaced = trial, trial_displaced
             break
         trial_sums = Sums(*_pixel_sums(*about, trial, trial_displaced))
-        trial_normal = Normal.of(trial_sums, trial_displaced, prior)
+        trial_normal = NormalEquations.of(trial_sums, trial_displaced, prior)
         trial_cost = trial_normal.cost + float(held @ trial**2)
         if trial_cost <= cost:
             gained, cost = cost - trial_cost, trial_cost

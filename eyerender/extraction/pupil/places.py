@@ -20,7 +20,7 @@ TAN_1, TAN_2, TAN_3, TAN_4, TAN_5 = (math.tan(2.0 * math.pi * k / SECTORS) for k
 Value = TypeVar("Value", float, Floats)
 
 
-class Place(NamedTuple, Generic[Value]):
+class EllipsePlaces(NamedTuple, Generic[Value]):
     """Position relative to an ellipse: of one point, or of n points as arrays.
 
     Attributes:
@@ -48,29 +48,31 @@ PLACES = 8 * BLOCK  # numbers in a block of places
 
 
 @inlined
-def place_in(block: Floats, i: int) -> Place[float]:
+def place_in(block: Floats, i: int) -> EllipsePlaces[float]:
     """Read place i of a block (PLACES,)."""
-    return Place(
+    return EllipsePlaces(
         block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i],
         block[4 * BLOCK + i], block[5 * BLOCK + i], block[6 * BLOCK + i], block[7 * BLOCK + i],
     )  # fmt: skip
 
 
 @inlined
-def put_place(block: Floats, i: int, place: Place[float]) -> None:
+def put_place(block: Floats, i: int, place: EllipsePlaces[float]) -> None:
     """Write place i of a block (PLACES,)."""
     block[i], block[BLOCK + i], block[2 * BLOCK + i], block[3 * BLOCK + i] = place[:4]
     block[4 * BLOCK + i], block[5 * BLOCK + i], block[6 * BLOCK + i], block[7 * BLOCK + i] = place[4:]
 
 
-def middles(ellipse: Ellipse, count: int = SECTORS) -> Place[Floats]:
+def middles(ellipse: Ellipse, count: int = SECTORS) -> EllipsePlaces[Floats]:
     """Return the places on the ellipse in the middle of each of `count` sectors."""
     (a, b), angle = ellipse.semi_axes_px.tolist(), ellipse.angle_rad
     u = 2.0 * np.pi * ((np.arange(count) + 0.5) / count - 0.5)
     cos_t, sin_t = np.cos(u - angle), np.sin(u - angle)
     nx, ny = b * cos_t, a * sin_t
     height = np.sqrt(nx * nx + ny * ny)
-    return Place(np.zeros(count), cos_t, sin_t, nx / height, ny / height, a * b / height**3, np.cos(u), np.sin(u))
+    return EllipsePlaces(
+        np.zeros(count), cos_t, sin_t, nx / height, ny / height, a * b / height**3, np.cos(u), np.sin(u)
+    )
 
 
 @inlined
@@ -90,7 +92,7 @@ def find_places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, co
         p, q = dx * cos + dy * sin, dy * cos - dx * sin
         c, s = p / a, q / b
         scale = 1.0 / max(math.sqrt(c * c + s * s), 1e-300)
-        put_place(out, i, Place(0.0, c * scale, s * scale, 0.0, 0.0, 0.0, p, q))
+        put_place(out, i, EllipsePlaces(0.0, c * scale, s * scale, 0.0, 0.0, 0.0, p, q))
     if eccentric > 1e-9 * a * a:
         for _ in range(STEPS):
             for i in range(count):
@@ -101,17 +103,17 @@ def find_places(ellipse: tuple[float, ...], x: Floats, y: Floats, start: int, co
                 turn = min(max(value / min(slope, -1e-9), -0.3), 0.3)
                 c, s = c + turn * s, s - turn * c
                 scale = 1.0 / math.sqrt(c * c + s * s)
-                put_place(out, i, Place(0.0, c * scale, s * scale, 0.0, 0.0, 0.0, p, q))
+                put_place(out, i, EllipsePlaces(0.0, c * scale, s * scale, 0.0, 0.0, 0.0, p, q))
     for i in range(count):
         _, c, s, _, _, _, p, q = place_in(out, i)
         nx, ny = b * c, a * s
         scale = 1.0 / math.sqrt(nx * nx + ny * ny)
         nx, ny = nx * scale, ny * scale
         distance, curvature = (p - a * c) * nx + (q - b * s) * ny, a * b * scale * scale * scale
-        put_place(out, i, Place(distance, c, s, nx, ny, curvature, c * cos - s * sin, s * cos + c * sin))
+        put_place(out, i, EllipsePlaces(distance, c, s, nx, ny, curvature, c * cos - s * sin, s * cos + c * sin))
 
 
-def distance_slopes(place: Place[Value], cos: float, sin: float) -> tuple[Value, Value, Value, Value, Value]:
+def distance_slopes(place: EllipsePlaces[Value], cos: float, sin: float) -> tuple[Value, Value, Value, Value, Value]:
     """Compute derivatives of the signed distance by cx, cy and the shape matrix (aa, bb, ab) in the ellipse's axes.
 
     `cos` and `sin` are those of the ellipse's angle.

@@ -10,11 +10,11 @@ import numpy as np
 from ...base.arrays import Bools, Floats
 from ...base.jit import compiled
 from ...optics.ellipse import Ellipse
-from ..preprocessing import Image, Part
+from ..preprocessing import Image, ImagePart
 from .algebraic import direct_fits
 from .covariance import SHAPE, hidden_part, outline_slopes, sector_excess, to_axes, towards_round
 from .edge_model import EdgeModel, longest_gap
-from .least_squares import FIXED, Band, Normal, Pixels, Prior, Solution, Sums, fitted
+from .least_squares import FIXED, Band, BoundaryPixels, NormalEquations, Prior, Solution, Sums, fitted
 from .occlusion import clear_of_lids, visible_part
 from .places import SECTORS, middles, sectors_at
 
@@ -43,7 +43,7 @@ TURNS, PATIENCE = (4, 2, 1), 2
 class _Ended:
     """The end of a fit: its pixels, solution and prior, the explained sectors, and the reach of its band."""
 
-    pixels: Pixels
+    pixels: BoundaryPixels
     found: Solution
     prior: Prior
     seen: Bools
@@ -94,7 +94,7 @@ class PixelFit:
 
 
 def refine(
-    part: Part,
+    part: ImagePart,
     start: EdgeModel,
     sectors: Bools,
     masked: Bools,
@@ -121,7 +121,7 @@ def refine(
 
 
 def _fitted(
-    part: Part,
+    part: ImagePart,
     start: EdgeModel,
     sectors: Bools,
     masked: Bools,
@@ -155,7 +155,7 @@ def _fitted(
     allowed = sectors | (longest_gap(sectors) < LID)
     displaced = np.zeros(SECTORS) if model.displaced is None else model.displaced.copy()
     for turn in range(turns):
-        pixels = Pixels.of(band, use, seen)
+        pixels = BoundaryPixels.of(band, use, seen)
         if pixels.x.size < 60:
             return "too few pixels on the boundary are free of glints and lids"
         begun = displaced[pixels.sector]
@@ -189,7 +189,7 @@ def _rough(model: EdgeModel, uneven_px: float) -> bool:
     return uneven_px > ROUGH * math.sqrt(float(model.ellipse.semi_axes_px.prod()))
 
 
-def _near_boundary(part: Part, model: EdgeModel, masked: Bools, reach_out: float) -> Band:
+def _near_boundary(part: ImagePart, model: EdgeModel, masked: Bools, reach_out: float) -> Band:
     """Collect the pixels near the boundary.
 
     The band reaches 4 sigma + 1 px inside the boundary and `reach_out` sigma + 1 px outside it, but not beyond
@@ -239,10 +239,10 @@ def _padded(outer: Floats, order: int) -> Floats:
     return out
 
 
-def _best_order(pixels: Pixels, found: Solution, prior: Prior) -> int:
+def _best_order(pixels: BoundaryPixels, found: Solution, prior: Prior) -> int:
     """Compute the Fourier order of the outer level by BIC, from one linear step with the largest order's columns."""
     full = replace(found.model, outer=_padded(found.model.outer, ORDERS[-1]))
-    normal = Normal.of(Sums.of(pixels, full, found.displaced), found.displaced, prior)
+    normal = NormalEquations.of(Sums.of(pixels, full, found.displaced), found.displaced, prior)
     matrix, vector, total = normal.matrix, normal.vector, normal.cost - float(normal.along**2 @ normal.inverse)
     count = pixels.level.size
     scale = 1.0 / np.sqrt(np.diag(matrix) + 1e-9)
@@ -269,7 +269,7 @@ def _sane(model: EdgeModel, start: EdgeModel) -> bool:
 def _report(ended: _Ended, noise_dn: float, scatter_px: float) -> PixelFit:
     pixels, found, prior, seen, model = ended.pixels, ended.found, ended.prior, ended.seen, ended.model
     of_pixels, count, variance = found.sums, pixels.level.size, ended.variance
-    normal = Normal.of(of_pixels, found.displaced, prior)
+    normal = NormalEquations.of(of_pixels, found.displaced, prior)
     matrix = normal.matrix + np.diag(prior.of_all(of_pixels.matrix.shape[0]))
     inverse = np.asarray(np.linalg.inv(matrix + 1e-12 * np.diag(np.diag(matrix))), dtype=np.float64)
     influence, own = inverse[:SHAPE], np.zeros((SHAPE, SHAPE))

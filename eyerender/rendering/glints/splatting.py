@@ -18,7 +18,7 @@ from ..scene.blur import Blur
 from ..scene.region import RegionScene, blockers
 from .cutdiscs import POINT, quadrature
 from .purkinje import purkinje_images
-from .tracing import Glint, GlintScene, GlintTable, Image, Images, Spots, glint_table
+from .tracing import Glint, GlintScene, GlintTable, Image, LampImages, LampSpots, glint_table
 
 _FRAMED = "occluded by frame"
 _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
@@ -28,7 +28,7 @@ _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
 class Shine:
     """Contribution of a mirror image to an image: spots, share of the exposure, circle of confusion (px)."""
 
-    spots: Spots
+    spots: LampSpots
     share: float
     blur_px: float
 
@@ -84,7 +84,7 @@ class MirrorImages:
     job: RenderJob
     lamps: tuple[Lamp, ...]
     scene: GlintScene
-    first: Images
+    first: LampImages
     further: dict[int, list[Image]]
     nearness: Floats
 

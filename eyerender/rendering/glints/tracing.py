@@ -65,7 +65,7 @@ class GlintTable(ArrayValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spots(ArrayValue):
+class LampSpots(ArrayValue):
     """Points of a lamp's image: positions (k, 2) px and energies (k,)."""
 
     xy_px: Floats
@@ -95,9 +95,9 @@ class Image:
     found: Bools
 
     @property
-    def spots(self) -> Spots:
+    def spots(self) -> LampSpots:
         """Return the points that the eye mirrors to the camera."""
-        return Spots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
+        return LampSpots(frozen(self.xy_px[self.there]), frozen(self.energy[self.there]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +112,11 @@ class Glint:
 
     image: Image
     clear: Bools
-    spots: Spots
+    spots: LampSpots
 
 
 @dataclass(frozen=True, slots=True)
-class Images:
+class LampImages:
     """Images of the lamps before occlusion, with the numbers of circles and points that wide lamps need."""
 
     parts: list[Image]
@@ -153,7 +153,7 @@ class GlintScene:
             sclera_radius_mm=float(eye.sclera.radius_mm), M=M, t=t, camera=camera, mesh=mesh,
         )  # fmt: skip
 
-    def images(self, lights: Sequence[Lamp], sigma_px: float) -> Images:
+    def images(self, lights: Sequence[Lamp], sigma_px: float) -> LampImages:
         """Compute the image of each lamp as finely as its size and the point-spread function require."""
         images = self._images_of(_roughly(*lights))
         wide = [k for k, lamp in enumerate(lights) if lamp.radius_mm > 0]
@@ -163,9 +163,9 @@ class GlintScene:
             finely = self._images_at([lights[k] for k in more], [quadrature(*counts[k]) for k in more])
             for k, image in zip(more, finely, strict=True):
                 images[k] = join_rows([image, take_rows(images[k], slice(-_ON_RIM, None))])
-        return Images(images, counts)
+        return LampImages(images, counts)
 
-    def glints(self, lights: Sequence[Lamp], images: Images, clear: Visibility) -> list[Glint]:
+    def glints(self, lights: Sequence[Lamp], images: LampImages, clear: Visibility) -> list[Glint]:
         """Compute the glints of lamps from their images, as finely as their edges require."""
         glints = self.seen(images.parts, clear)
         for k, count in images.counts.items():
@@ -196,10 +196,10 @@ class GlintScene:
         for image, rows in zip(images, _parts([len(i.energy) for i in images]), strict=True):
             open_ = free[rows]
             lit = open_ & image.there & (image.energy > 0)
-            out.append(Glint(image, open_, Spots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
+            out.append(Glint(image, open_, LampSpots(frozen(image.xy_px[lit]), frozen(image.energy[lit]))))
         return out
 
-    def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int], clear: Visibility) -> Spots:
+    def _cut(self, lamp: Lamp, image: Image, counts: tuple[int, int], clear: Visibility) -> LampSpots:
         """Compute spots of the visible part of a lamp whose whole `image` is known at some points."""
         mirror = self._mirror_map(lamp, image)
 

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..materials.albedo import limbal_radius, opacity, stop_coordinates
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import syntax
 from ..records.surfaces import DEVICE
 from .interaction import EPSILON_MM, SurfaceInteraction
@@ -48,7 +48,7 @@ class EyeHit:
 class EyeShape:
     """The cornea and the sclera of a frame as one shape."""
 
-    frame: Frame
+    frame: DeviceFrame
 
     def ray_intersect_preliminary(self, o: mi.Vector3f, d: mi.Vector3f) -> EyeHit:
         """Intersect rays (scene's frame) with the eye, ignoring all other surfaces."""
@@ -120,7 +120,7 @@ class EyeShape:
         return si
 
 
-def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> None:
+def _refract(frame: DeviceFrame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Vector3f, dl: mi.Vector3f) -> None:
     """Refract rays at the cornea and record what they meet; see `EyeShape._through_cornea`."""
     front = frame.surfaces[0]
     bend = DEVICE.refract(dl, facing, front.eta)
@@ -146,7 +146,7 @@ def _refract(frame: Frame, si: SurfaceInteraction, facing: mi.Vector3f, x: mi.Ve
     si.pupil = reached & (pu * pu + pv * pv < margin * margin)
 
 
-def _beyond_root(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
+def _beyond_root(frame: DeviceFrame, x: mi.Vector3f) -> mi.Vector3f:
     """Return points in the plane of the iris, just beyond its root, that represent points behind the plane.
 
     In a shallow chamber the cornea may end behind the plane, and a real iris bends back to its root. Its illumination

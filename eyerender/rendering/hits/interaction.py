@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..materials.albedo import sclera_albedo
 from ..materials.gloss import glossy_normal, rippled_film
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import syntax
 from ..records.surfaces import Bundle
 
@@ -97,7 +97,7 @@ class SurfaceInteraction:
         return self.cornea | self.sclera | self.other
 
     @syntax
-    def nearness(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
+    def nearness(self, frame: DeviceFrame, d: mi.Vector3f) -> mi.Float:
         """Compute the inverse depth (1/mm) of what camera rays along d (scene's frame) show, for defocus.
 
         Behind the cornea, this is the change of direction that keeps a ray on its point in the plane of the iris while
@@ -108,7 +108,7 @@ class SurfaceInteraction:
             near = dr.clip(self._nearness_inside(frame, d), _DEEPEST * near, near)
         return near
 
-    def _nearness_inside(self, frame: Frame, d: mi.Vector3f) -> mi.Float:
+    def _nearness_inside(self, frame: DeviceFrame, d: mi.Vector3f) -> mi.Float:
         """Compute the inverse depth (1/mm) of the plane of the iris behind the cornea."""
         camera, front = frame.camera, frame.surfaces[0]
         cosine = dr.dot(d, camera.forward)
@@ -128,7 +128,7 @@ class SurfaceInteraction:
         return 0.5 * both / dr.dot(w, dr.cross(a, b))
 
 
-def tear_film(frame: Frame, si: SurfaceInteraction) -> tuple[mi.Vector3f, mi.Float]:
+def tear_film(frame: DeviceFrame, si: SurfaceInteraction) -> tuple[mi.Vector3f, mi.Float]:
     """Return normal (eye frame) and gloss of the film that mirrors lamps; on some people's sclera it has ripples."""
     on = si.sclera & ~si.other & (frame.sclera.ripples > 0)
     normal, gloss = rippled_film(si.normal, frame.sclera.ripples, si.distance / frame.camera.focal[0])
@@ -136,7 +136,7 @@ def tear_film(frame: Frame, si: SurfaceInteraction) -> tuple[mi.Vector3f, mi.Flo
 
 
 @syntax
-def outer_albedo(frame: Frame, si: SurfaceInteraction) -> mi.Float:
+def outer_albedo(frame: DeviceFrame, si: SurfaceInteraction) -> mi.Float:
     """Return the albedo of the first surface where it is matte: sclera, limbus' rim, or the scene's own material."""
     albedo = mi.Float(si.albedo)
     if dr.hint(~si.other, exclude=[frame, si]):

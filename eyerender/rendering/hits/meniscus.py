@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...optics.media import TEARS
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import syntax
 from ..records.surfaces import DEVICE
 from .eyeshape import EyeShape
@@ -27,20 +27,20 @@ _LEAST = 0.1  # cosine below which a ray is not followed
 
 
 @dataclass(kw_only=True)
-class View:
+class MeniscusView:
     """The surface that a camera ray shows, and its direction in air there (scene's frame)."""
 
     si: SurfaceInteraction
     d: mi.Vector3f
 
 
-def water_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> TriangleHit:
+def water_hit(frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> TriangleHit:
     """Intersect camera rays (scene's frame) with the menisci that lie before their first hit."""
     hit = frame.region.water.ray_intersect_preliminary(segment(o, d, nearest), coherent=True, active=True)
     return replace(TriangleHit.of(hit), prim_index=frame.region.on_water(hit))
 
 
-def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
+def on_water(frame: DeviceFrame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> SurfaceInteraction:
     """Replace the surface met by camera rays with a meniscus where one is in front of it."""
     if frame.region is None or frame.region.water is None:
         return si
@@ -53,20 +53,20 @@ def on_water(frame: Frame, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3
 
 @syntax
 def through_water(
-    frame: Frame, hit: TriangleHit, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
+    frame: DeviceFrame, hit: TriangleHit, si: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f
 ) -> tuple[SurfaceInteraction, mi.Vector3f]:
     """Refract camera rays at menisci that they hit in front of the globe.
 
     Returns:
         The surface of the globe that they show, and their directions in air in front of it.
     """
-    view = View(si=si, d=mi.Vector3f(d))
+    view = MeniscusView(si=si, d=mi.Vector3f(d))
     if dr.hint(hit.is_valid() & ~si.other, exclude=[frame, hit, si, o, d]):
         view = _bent(frame, hit, view, o, d)
     return view.si, view.d
 
 
-def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vector3f) -> View:
+def _bent(frame: DeviceFrame, hit: TriangleHit, view: MeniscusView, o: mi.Vector3f, d: mi.Vector3f) -> MeniscusView:
     """Refract rays into the water and out of it; rays without a solution keep their direction."""
     si = view.si
     x = o + hit.t * d
@@ -83,7 +83,7 @@ def _bent(frame: Frame, hit: TriangleHit, view: View, o: mi.Vector3f, d: mi.Vect
     forward, dry = frame.camera.forward, mi.Float(0)
     seen.distance = si.distance * (dr.dot(d, forward) / dr.dot(way, forward))
     seen, kept = (replace(s, gloss=dry, mirrored=dry) for s in (seen, si))
-    return View(si=dr.select(found, seen, kept), d=dr.select(found, way, d))
+    return MeniscusView(si=dr.select(found, seen, kept), d=dr.select(found, way, d))
 
 
 def _refracted(d: mi.Vector3f, normal: mi.Vector3f, eta: mi.Float) -> tuple[mi.Vector3f, mi.Bool]:

@@ -25,11 +25,10 @@ from ...base.arrays import Bools, Cache, Floats, Ints
 from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
 from ...optics.formulas import NUMPY
-from ...optics.surfaces import Surface as ExactSurface
-from ...optics.surfaces import components, join
+from ...optics.surfaces import Surface, components, join
 from ...optics.transforms import normalize
 from ..records.frame import aligned_copy, upload_array
-from ..records.surfaces import Bundle, NormalForm, Surface
+from ..records.surfaces import Bundle, DeviceSurface, NormalForm
 
 _ABOVE_MM = 40.0  # height beyond every cornea along its axis
 _STEPS = 12
@@ -130,7 +129,7 @@ class SurfaceMesh:
         geometry: the same mesh for the kernels.
     """
 
-    def __init__(self, patch: Patch, surface: ExactSurface) -> None:
+    def __init__(self, patch: Patch, surface: Surface) -> None:
         self.rotation, self.origin = np.asarray(surface.rotation), np.asarray(surface.origin_mm)
         self.vertices = (patch.vertices - self.origin) @ self.rotation
         self.normals = patch.normals @ self.rotation
@@ -197,7 +196,7 @@ def _either(which: mi.Bool, one: NormalForm, other: NormalForm) -> NormalForm:
 
 
 @dataclass(frozen=True, slots=True)
-class MeshedSurface(Surface):
+class MeshedSurface(DeviceSurface):
     """A refracting surface whose hits, normals and their slopes are those of a mesh."""
 
     mesh: MeshGeometry | None = None
@@ -219,7 +218,7 @@ class MeshedSurface(Surface):
         hit = self._mesh().above(l.y, l.z)
         met = hit.is_valid()
         height, form = self._mesh().form(hit)
-        outside, other = Surface.on_surface(self, x)
+        outside, other = DeviceSurface.on_surface(self, x)
         point = dr.select(met, x + self.vector_out(mi.Vector3f(height - l.x, 0, 0)), outside)
         return point, _either(met, form, other)
 
@@ -228,7 +227,7 @@ class MeshedSurface(Surface):
         hit = self._mesh().hit(self.point_in(b.y), self.vector_in(b.w))
         met = hit.is_valid()
         t, form = hit.t, self._mesh().form(hit)[1]
-        far, ok, _ = Surface.meet(self, self.point_in(b.y), self.vector_in(b.w))
+        far, ok, _ = DeviceSurface.meet(self, self.point_in(b.y), self.vector_in(b.w))
         t = dr.select(met, t, far)
         there = b.advance(t)
         out, share, c = self.bend(there, _either(met, form, self._normal_form(self.point_in(there.y))))
@@ -258,7 +257,7 @@ def resolution(radius_mm: float, edge_mm: float) -> tuple[int, int]:
     return math.ceil(radius_mm / edge_mm), max(8, math.ceil(2 * math.pi * radius_mm / edge_mm))
 
 
-def meshed(surfaces: Sequence[Surface], meshes: Sequence[SurfaceMesh]) -> tuple[Surface, ...]:
+def meshed(surfaces: Sequence[DeviceSurface], meshes: Sequence[SurfaceMesh]) -> tuple[DeviceSurface, ...]:
     """Replace surfaces by their meshes."""
     return tuple(
         MeshedSurface(s.origin, s.axes, s.shape, s.eta, s.kind, s.table, s.film, mesh.geometry)

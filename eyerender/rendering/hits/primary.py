@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import syntax
 from ..scene.background import HALF_MM
 from .eyeshape import EyeShape
@@ -45,14 +45,14 @@ class TriangleHit:
         return self.t < dr.inf
 
 
-def first_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> SurfaceInteraction:
+def first_hit(frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool) -> SurfaceInteraction:
     """Trace camera rays (scene's frame) to the first surface and through the cornea to the plane of the iris."""
     si, hit = intersect(frame, o, d, active)
     return appearance(frame, si, hit, d)
 
 
 def intersect(
-    frame: Frame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
+    frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, active: mi.Bool, *, coherent: bool = True
 ) -> tuple[SurfaceInteraction, TriangleHit]:
     """Trace rays (scene's frame); surfaces other than the eye are not evaluated yet (see `appearance`).
 
@@ -64,7 +64,7 @@ def intersect(
 
 
 def hit_before(
-    frame: Frame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float, active: mi.Bool, *, coherent: bool = True
+    frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float, active: mi.Bool, *, coherent: bool = True
 ) -> TriangleHit:
     """Intersect rays (scene's frame) with everything but the eye, up to a distance."""
     if not frame.structure.obstacles:
@@ -80,7 +80,7 @@ def behind(eye: SurfaceInteraction, hit: TriangleHit, active: mi.Bool) -> Surfac
     return replace(eye, cornea=eye.cornea & clear, sclera=eye.sclera & clear, other=other, distance=distance)
 
 
-def appearance(frame: Frame, si: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f) -> SurfaceInteraction:
+def appearance(frame: DeviceFrame, si: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f) -> SurfaceInteraction:
     """Add the surfaces other than the eye to the result of `intersect` along d."""
     region, background = frame.region, frame.background
     if region is not None:
@@ -98,13 +98,13 @@ def appearance(frame: Frame, si: SurfaceInteraction, hit: TriangleHit, d: mi.Vec
     )
 
 
-def region_hit(frame: Frame, o: mi.Vector3f, d: mi.Vector3f) -> TriangleHit:
+def region_hit(frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f) -> TriangleHit:
     """Intersect camera rays (scene's frame) with an eye region in front of the globe."""
     ray = segment(o, d, EyeShape(frame=frame).ray_intersect_preliminary(o, d).t)
     return TriangleHit.of(frame.scene.ray_intersect_preliminary(ray, coherent=True, active=True))
 
 
-def hidden(frame: Frame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
+def hidden(frame: DeviceFrame, eye: SurfaceInteraction, o: mi.Vector3f, d: mi.Vector3f) -> mi.Bool:
     """Return whether anything of the scene is in front of the globe along the rays that meet it."""
     if not frame.structure.obstacles:
         return eye.globe & TriangleHit.on_plane(frame.backdrop_x, o, d, eye.distance).is_valid()
@@ -128,7 +128,7 @@ def segment(o: mi.Vector3f, d: mi.Vector3f, length: mi.Float) -> mi.Ray3f:
 
 
 def region_interaction(
-    frame: Frame, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool
+    frame: DeviceFrame, face: mi.UInt32, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool
 ) -> SurfaceInteraction:
     """Compute the interaction of rays along d (scene's frame) with triangles of an eye region."""
     skin = frame.region.surface(face, uv, active)
@@ -138,14 +138,14 @@ def region_interaction(
 
 
 def _matte(
-    frame: Frame, point: mi.Vector3f, normal: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
+    frame: DeviceFrame, point: mi.Vector3f, normal: mi.Vector3f, d: mi.Vector3f, active: mi.Bool
 ) -> SurfaceInteraction:
     """Compute the interaction with matte points of the scene, with normals turned to the viewer."""
     place = frame.point_to_eye(point)
     return replace(SurfaceInteraction.blank(), other=active, point=place, normal=facing(frame, normal, d))
 
 
-def facing(frame: Frame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+def facing(frame: DeviceFrame, normal: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
     """Compute normals (eye frame) turned to the viewer; normals and rays are given in the scene's frame."""
     normal = frame.vector_to_eye(normal)
     return dr.normalize(dr.select(dr.dot(normal, frame.vector_to_eye(d)) > 0, -normal, normal))

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...base.arrays import Ints, frozen
 from ..hits.primary import intersect
-from ..records.frame import Frame, aligned_copy
+from ..records.frame import DeviceFrame, aligned_copy
 from ..records.recording import recorded
 from .sampling import FilmRequest, Pattern, Pixels, Samples, lattice_generator
 from .shading import shade
@@ -125,7 +125,7 @@ def _first_samples(count: int) -> Ints:
 
 @recorded
 def _shade_samples(
-    frame: Frame, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool
+    frame: DeviceFrame, pixels: Pixels, pattern: Pattern, pixel: mi.UInt32, k: mi.UInt32, layered: bool
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Compute the radiance of samples k of pixels, and count failed light paths."""
     samples = Samples.of(*pixels.at(pixel), pattern)

@@ -22,7 +22,7 @@ import numpy as np
 from ...base.arrays import Singles
 from ...rig.camera import Window
 from ...rig.stray import block_px, misses_light
-from ..records.frame import SMALL, Frame
+from ..records.frame import SMALL, DeviceFrame
 from ..records.recording import recorded, syntax
 from .bare import is_adaptive, render_adaptively, render_samples
 from .groups import LampTurns, PixelGroup
@@ -130,7 +130,7 @@ def _render_groups(request: FilmRequest, first: int, count: int) -> tuple[list[m
 
 
 def _group(
-    frame: Frame, groups: GroupPass, pattern: Pattern, hits: HitTable, layered: bool, lane: mi.UInt32
+    frame: DeviceFrame, groups: GroupPass, pattern: Pattern, hits: HitTable, layered: bool, lane: mi.UInt32
 ) -> tuple[PixelGroup, mi.Bool]:
     """Return the sample groups of lanes, and whether their pixels are inside the window.
 
@@ -187,7 +187,7 @@ def _added(sums: list[mi.Float], lanes: list[mi.Float], i: mi.UInt32) -> list[mi
 
 @recorded
 def _shade(
-    frame: Frame, groups: GroupPass, pattern: Pattern, hits: HitTable, layered: bool, lanes: int, pixels: int
+    frame: DeviceFrame, groups: GroupPass, pattern: Pattern, hits: HitTable, layered: bool, lanes: int, pixels: int
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Merge and shade the groups of a pass, one per lane, and sum over those of each pixel."""
     group, inside = _group(frame, groups, pattern, hits, layered, dr.arange(mi.UInt32, lanes))

@@ -18,7 +18,7 @@ from ...region.mesh import RegionMesh, region_mesh
 from ...rig.imaging import Ambient
 from ..hits.meshes import Meshes, meshed
 from ..materials.albedo import Textures
-from ..records.frame import Frame, Lights, Structure, upload_array
+from ..records.frame import DeviceFrame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
 from ..scene.background import Background, Obstacle
@@ -52,7 +52,7 @@ class _Next:
 
 @recorded
 def _grids_behind_cornea(
-    frame: Frame, shape: ReliefShape | None, side: mi.UInt32, points: tuple[mi.UInt32, mi.UInt32],
+    frame: DeviceFrame, shape: ReliefShape | None, side: mi.UInt32, points: tuple[mi.UInt32, mi.UInt32],
     factors: mi.Float | None, lamps: int | None, relief: tuple[int, int],
 ) -> tuple[IrisIrradiance | None, IrisRelief, FundusIrradiance]:  # fmt: skip
     """Fill the irradiance grids behind the cornea: on the iris, on its relief, and on the fundus.
@@ -128,7 +128,7 @@ class FrameBuilder:
             ambient=job.ambient.model_copy(update={"sun": None}) != Ambient(),
             scattering=region is not None and region.skin.is_sheet and job.look.scattering is not None,
         )
-        frame = Frame.upload(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
+        frame = DeviceFrame.upload(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
         frame.lights, frame.textures, frame.scene = Lights.upload(host.lamps), textures, surroundings.scene
         if isinstance(surroundings, RegionScene):
             frame.region = surroundings.skin
@@ -148,7 +148,7 @@ class FrameBuilder:
         return BoundFrame(frame, host), surroundings
 
     def _light(
-        self, host: HostData, frame: Frame, surroundings: Background | RegionScene, after: RenderJob | None
+        self, host: HostData, frame: DeviceFrame, surroundings: Background | RegionScene, after: RenderJob | None
     ) -> None:
         """Compute the radiosity and fill the irradiance grids that the frame can use."""
         job = host.job
@@ -165,7 +165,7 @@ class FrameBuilder:
             points = dr.opaque(mi.UInt32, host.lamps.points)
             frame.caches.globe = GlobeIrradiance.build(frame, reach, points, host.lamps.gridded)
 
-    def _fill_grids(self, host: HostData, frame: Frame, surroundings: Background | RegionScene) -> None:
+    def _fill_grids(self, host: HostData, frame: DeviceFrame, surroundings: Background | RegionScene) -> None:
         """Fill the irradiance grids behind the cornea."""
         job, lamps, heights = host.job, host.lamps, frame.textures.heights
         size = ReliefSize.of(job)

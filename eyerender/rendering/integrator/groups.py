@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..hits.primary import TriangleHit, region_hit
-from ..records.frame import Frame, Lamp, Lights, quotient
+from ..records.frame import DeviceFrame, DeviceLamp, Lights, quotient
 from ..records.recording import syntax
 from .sampling import Samples
 from .visibility import HitTable
@@ -26,7 +26,7 @@ from .visibility import HitTable
 class LampShare:
     """A lamp, and its weight: the number of users for which the ray of one user stands."""
 
-    lamp: Lamp
+    lamp: DeviceLamp
     weight: mi.Float
 
 
@@ -100,13 +100,13 @@ class PixelGroup:
         """Return the number of sample j within its pixel."""
         return self.number * self.count + j
 
-    def ray(self, frame: Frame, j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+    def ray(self, frame: DeviceFrame, j: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         """Return origin and direction (scene's frame) of sample j, and its weight, cos^4(theta) / D of `camera_ray`."""
         o, d, root = self.samples.ray(frame, self.of_pixel(j))
         return o, d, root * root
 
     @syntax
-    def hit(self, frame: Frame, j: mi.UInt32) -> TriangleHit:
+    def hit(self, frame: DeviceFrame, j: mi.UInt32) -> TriangleHit:
         """Return the hit of sample j on the region."""
         hit = self.hits.at(self.first_hit + dr.select(self.plain, 0, j))
         # Occasionally a ray slips between two triangles. Then the sample stands for itself only.

@@ -10,11 +10,11 @@ import mitsuba as mi
 
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
-from ..hits.meniscus import View, through_water, water_hit
+from ..hits.meniscus import MeniscusView, through_water, water_hit
 from ..hits.primary import TriangleHit, behind, region_interaction
 from ..materials.albedo import sclera_albedo
 from ..materials.gloss import glossy_normal
-from ..records.frame import Frame, Lamp
+from ..records.frame import DeviceFrame, DeviceLamp
 from ..records.recording import syntax
 from ..transport.directlight import direct_light, irradiance_through_cornea, lamp_blocked, on_relief
 from .groups import PixelGroup
@@ -56,7 +56,7 @@ class GlobeSamples:
         return self.water + self.lit * dr.select(self.shaded > 0, self.weight / self.shaded, 0)
 
 
-def shade_group(frame: Frame, group: PixelGroup) -> tuple[list[mi.Float], mi.UInt32]:
+def shade_group(frame: DeviceFrame, group: PixelGroup) -> tuple[list[mi.Float], mi.UInt32]:
     """Sum the radiance of a group's samples, and count the failed light paths.
 
     Returns:
@@ -81,7 +81,7 @@ def shade_group(frame: Frame, group: PixelGroup) -> tuple[list[mi.Float], mi.UIn
 
 
 @syntax
-def shade_globe(frame: Frame, group: PixelGroup) -> GlobeSamples:
+def shade_globe(frame: DeviceFrame, group: PixelGroup) -> GlobeSamples:
     """Shade a group's samples on the globe."""
     globe, i = GlobeSamples.none(), mi.UInt32(0)
     while dr.hint(i < group.count, label="globe", exclude=[frame, group]):
@@ -94,10 +94,12 @@ def shade_globe(frame: Frame, group: PixelGroup) -> GlobeSamples:
 
 
 @syntax
-def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: mi.UInt32, hit: TriangleHit) -> None:
+def _add_globe_sample(
+    frame: DeviceFrame, group: PixelGroup, globe: GlobeSamples, j: mi.UInt32, hit: TriangleHit
+) -> None:
     """Add the light of sample j from the globe and from menisci."""
     o, d, weight = group.ray(frame, j)
-    view = View(si=behind(EyeShape(frame=frame).ray_intersect(o, d), hit, mi.Bool(True)), d=mi.Vector3f(d))
+    view = MeniscusView(si=behind(EyeShape(frame=frame).ray_intersect(o, d), hit, mi.Bool(True)), d=mi.Vector3f(d))
     if dr.hint(group.wet, exclude=[frame, group, o, j, weight]):
         _look_through_water(frame, group, globe, view, o, j, weight)
     on_globe = view.si.globe
@@ -115,7 +117,13 @@ def _add_globe_sample(frame: Frame, group: PixelGroup, globe: GlobeSamples, j: m
 
 
 def _look_through_water(
-    frame: Frame, group: PixelGroup, globe: GlobeSamples, view: View, o: mi.Vector3f, j: mi.UInt32, weight: mi.Float
+    frame: DeviceFrame,
+    group: PixelGroup,
+    globe: GlobeSamples,
+    view: MeniscusView,
+    o: mi.Vector3f,
+    j: mi.UInt32,
+    weight: mi.Float,
 ) -> None:
     """Add the light that menisci mirror along sample j's ray, and continue the view to the surface behind them."""
     if frame.region.water is None:
@@ -130,7 +138,9 @@ def _look_through_water(
     view.si, view.d = through_water(frame, hit, view.si, o, view.d)
 
 
-def _globe_radiance(frame: Frame, group: PixelGroup, view: View, j: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+def _globe_radiance(
+    frame: DeviceFrame, group: PixelGroup, view: MeniscusView, j: mi.UInt32
+) -> tuple[mi.Float, mi.UInt32]:
     """Compute the radiance of the globe along sample j's ray, and failed light paths."""
     si = on_relief(frame, replace(view.si, other=mi.Bool(False)))
     inner, failures = irradiance_through_cornea(frame, si.inner, si.lit_inside, *group.spot(j))
@@ -161,18 +171,18 @@ class _LitPoint:
     to_camera: mi.Vector3f
     spot: mi.Point2f
 
-    def source(self, lamp: Lamp) -> mi.Vector3f:
+    def source(self, lamp: DeviceLamp) -> mi.Vector3f:
         """Return the point of a lamp from which light arrives."""
         return lamp.point(self.spot.x, *dr.sincos(self.spot.y * (2 * dr.pi)))
 
-    def radiance(self, lamp: Lamp, albedo: mi.Float) -> tuple[mi.Float, mi.Float]:
+    def radiance(self, lamp: DeviceLamp, albedo: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Compute what an unblocked lamp adds to the radiance towards the viewer, and its irradiance of the point."""
         irradiance, shine = direct_light(lamp, self.source(lamp), self.si, (self.normal, self.to_camera))
         return direct(self.si, albedo, irradiance, shine), irradiance
 
 
 @syntax
-def _highlights_of_globe(frame: Frame, lit: _LitPoint, albedo: mi.Float) -> mi.Float:
+def _highlights_of_globe(frame: DeviceFrame, lit: _LitPoint, albedo: mi.Float) -> mi.Float:
     """Compute the tear film's highlight on the globe where subsurface light is already computed."""
     tissues, si = frame.caches.diffusion, lit.si
     covered, share = ~si.cornea | (si.opacity > 0), tissues.lamps_at_globe(frame, si.point)
@@ -186,7 +196,7 @@ def _highlights_of_globe(frame: Frame, lit: _LitPoint, albedo: mi.Float) -> mi.F
 
 
 @syntax
-def _lamps_on_globe(frame: Frame, group: PixelGroup, lit: _LitPoint, albedo: mi.Float, j: mi.UInt32) -> mi.Float:
+def _lamps_on_globe(frame: DeviceFrame, group: PixelGroup, lit: _LitPoint, albedo: mi.Float, j: mi.UInt32) -> mi.Float:
     """Compute the radiance of the matte globe at sample j: light of all lamps minus what is blocked.
 
     The samples of a pixel share their rays to the lamps, so noise occurs only where a shadow's edge crosses the pixel.
@@ -210,14 +220,18 @@ def _lamps_on_globe(frame: Frame, group: PixelGroup, lit: _LitPoint, albedo: mi.
 
 
 @syntax
-def shade_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.Float, *, on_sheet: bool) -> mi.Float:
+def shade_region(
+    frame: DeviceFrame, group: PixelGroup, point: RegionSample, total: mi.Float, *, on_sheet: bool
+) -> mi.Float:
     """Add the radiance of a merged point, times its weight, to `total`."""
     if dr.hint(point.weight > 0, exclude=[frame, group, point, on_sheet]):
         total = _add_region(frame, group, point, total, on_sheet)
     return total
 
 
-def _add_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.Float, on_sheet: bool) -> mi.Float:
+def _add_region(
+    frame: DeviceFrame, group: PixelGroup, point: RegionSample, total: mi.Float, on_sheet: bool
+) -> mi.Float:
     """Add light from other surfaces and from the lamps that the group uses."""
     _, d, _ = group.ray(frame, point.j)
     si = region_interaction(frame, point.face, point.uv, d, point.weight > 0)
@@ -236,7 +250,7 @@ def _add_region(frame: Frame, group: PixelGroup, point: RegionSample, total: mi.
 
 
 @syntax
-def _over_globe(frame: Frame, si: SurfaceInteraction, own: mi.Float) -> SurfaceInteraction:
+def _over_globe(frame: DeviceFrame, si: SurfaceInteraction, own: mi.Float) -> SurfaceInteraction:
     """Blend albedo and received light of thin conjunctiva with those of the globe below it."""
     albedo, received = mi.Float(si.albedo), mi.Vector4f(si.received)
     if dr.hint(own < 1, exclude=[frame, si, own]):
@@ -263,7 +277,7 @@ def _highlights_of_skin(
 
 @syntax
 def _lamps_on_region(
-    frame: Frame, group: PixelGroup, point: RegionSample, lit: _LitPoint, total: mi.Float, on_sheet: bool
+    frame: DeviceFrame, group: PixelGroup, point: RegionSample, lit: _LitPoint, total: mi.Float, on_sheet: bool
 ) -> mi.Float:
     """Add the light of lamps on a matte surface with highlights, including shadows."""
     k = mi.UInt32(0)

@@ -13,7 +13,7 @@ from ...eye.fundus import FundusLight
 from ...region.mesh import RegionMesh
 from ...rig.camera import Window
 from ..glints.splatting import MirrorImages
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.job import LampTable, RenderJob, parameters_of, returned_light, sun_lamps
 from ..records.parameters import Parameters
 from ..scene.blur import Blur
@@ -137,5 +137,5 @@ class HostData:
 class BoundFrame:
     """A frame on the device, ready to be rendered, and the host data of its job."""
 
-    frame: Frame
+    frame: DeviceFrame
     host: HostData

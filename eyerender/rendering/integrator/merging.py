@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..hits.primary import TriangleHit
-from ..records.frame import Frame, Lamp
+from ..records.frame import DeviceFrame, DeviceLamp
 from ..records.recording import syntax
 from ..transport.directlight import lamp_blocked, shadowless
 from .groups import PixelGroup
@@ -82,7 +82,7 @@ class RegionSample:
 
 
 @syntax
-def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSample]:
+def merge_hits(frame: DeviceFrame, group: PixelGroup) -> tuple[RegionSample, RegionSample]:
     """Merge a group's hits to one point on the sheet of skin and one in front of it."""
     sheet, before = RegionSample.none(), RegionSample.none()
     i, asked, blocked = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
@@ -100,7 +100,7 @@ def merge_hits(frame: Frame, group: PixelGroup) -> tuple[RegionSample, RegionSam
     return sheet, before
 
 
-def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
+def _weighted_hit(frame: DeviceFrame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
     """Read sample j's hit, and decide whether it needs its own shadow ray."""
     hit, (o, d, weight), near = group.hit(frame, j), group.ray(frame, j), mi.Float(0)
     x, on_sheet = o + hit.t * d, frame.region.on_sheet(hit.prim_index)
@@ -115,7 +115,7 @@ def _weighted_hit(frame: Frame, group: PixelGroup, j: mi.UInt32) -> WeightedHit:
     return WeightedHit(j=j, hit=hit, on_sheet=on_sheet, weight=weight, near=near, own_ray=own_ray)
 
 
-def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi.Bool) -> mi.Bool:
+def _own_shadow(frame: DeviceFrame, group: PixelGroup, sample: WeightedHit, active: mi.Bool) -> mi.Bool:
     """Return whether the group's first lamp is blocked from a sample's own hit."""
     lamp, spot = group.turns.share(group.number, mi.UInt32(0)).lamp, group.spot(sample.j)
     source = lamp.point(spot.x, *dr.sincos(spot.y * (2 * dr.pi)))
@@ -125,7 +125,7 @@ def _own_shadow(frame: Frame, group: PixelGroup, sample: WeightedHit, active: mi
 
 
 def blocked_from_region(
-    frame: Frame, lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, active: mi.Bool
+    frame: DeviceFrame, lamp: DeviceLamp, source: mi.Vector3f, x: mi.Vector3f, on_sheet: mi.Bool | bool, active: mi.Bool
 ) -> mi.Bool:
     """Return whether anything blocks a lamp's light at points x of the region (eye frame), on its sheet or in front."""
     # Where the lamp's shadow map shows only bare skin, only the globe may block the light.

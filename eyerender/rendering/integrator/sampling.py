@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...rig.camera import Window, distort, distorted_area, is_imaged, newton_step
-from ..records.frame import Frame, sequence
+from ..records.frame import DeviceFrame, sequence
 from .hostdata import BoundFrame
 
 _UNDISTORT_STEPS = 6
@@ -174,13 +174,13 @@ class Samples:
         pixel = (self.u & mi.UInt32(0xFFFF)) | (self.v << mi.UInt32(16))
         return mi.Point2f(*sequence(k, tea(pixel, self.keys[call])))
 
-    def ray(self, frame: Frame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+    def ray(self, frame: DeviceFrame, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         """Compute the camera ray of sample `k`, as in `camera_ray`."""
         place = self.in_pixel(k)
         return camera_ray(frame, mi.Float(self.u) + (place.x - 0.5), mi.Float(self.v) + (place.y - 0.5))
 
 
-def camera_ray(frame: Frame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
     """Compute the ray through pixel (u, v) in the scene's frame, with pixel centres at integers.
 
     Returns:

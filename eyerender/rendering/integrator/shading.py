@@ -15,14 +15,14 @@ from ..hits.interaction import EPSILON_MM, SurfaceInteraction, outer_albedo
 from ..hits.primary import first_hit
 from ..materials.albedo import iris_albedo, stop_coordinates
 from ..materials.gloss import film_normal, film_reflectance
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import syntax
 from ..transport.directlight import irradiance_through_cornea, on_relief, onto_matte
 
 _FLAT_MM = 1e-2  # distance from the plane of the background
 
 
-def shade(frame: Frame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:
+def shade(frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.UInt32]:
     """Compute the radiance (mW/mm^2/sr) along rays of the scene's frame for a bare eye, and count failed light paths.
 
     (u, v) is the position on each lamp's disc, [0, 1)^2.
@@ -45,7 +45,7 @@ def direct(si: SurfaceInteraction, albedo: mi.Float, outer: mi.Float, shine: mi.
 
 
 @syntax
-def of_surroundings(frame: Frame, si: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
+def of_surroundings(frame: DeviceFrame, si: SurfaceInteraction, known: mi.Bool) -> mi.Vector4f:
     """Return the light that a bare globe and its background receive from other surfaces.
 
     See `radiosityfield.RadiosityField`. Obstacles receive nothing. Where `known`, the light on the globe is left out.
@@ -59,7 +59,7 @@ def of_surroundings(frame: Frame, si: SurfaceInteraction, known: mi.Bool) -> mi.
 
 
 @syntax
-def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vector4f:
+def _from_other_surfaces(frame: DeviceFrame, other: mi.Bool, x: mi.Vector3f) -> mi.Vector4f:
     """Return the light from other surfaces at points x (scene's frame) of the globe, or of something `other`."""
     radiosity = frame.caches.radiosity
     if dr.hint(other, exclude=[frame, radiosity, x]):
@@ -71,7 +71,7 @@ def _from_other_surfaces(frame: Frame, other: mi.Bool, x: mi.Vector3f) -> mi.Vec
 
 
 def indirect(
-    frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
+    frame: DeviceFrame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, inner: mi.Float, received: mi.Vector4f
 ) -> mi.Float:
     """Compute all radiance except that of `direct`.
 
@@ -94,7 +94,9 @@ def indirect(
     return dr.select(si.met, rest, 0)
 
 
-def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f) -> mi.Float:
+def off_eye(
+    frame: DeviceFrame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Float, received: mi.Vector4f
+) -> mi.Float:
     """Compute the radiance as in `indirect`, except for the clear cornea."""
     even, mirrored = received.x, mi.Float(0)
     if frame.structure.ambient:
@@ -106,7 +108,7 @@ def off_eye(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f, albedo: mi.Flo
 
 
 @syntax
-def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> mi.Float:
+def _radiosity_of_iris(frame: DeviceFrame, si: SurfaceInteraction, lit: mi.Float) -> mi.Float:
     """Compute the radiosity in the plane of the iris, given its irradiance `lit` from the lamps."""
     radiosity = mi.Float(0)
     if dr.hint(si.lit_inside, exclude=[frame, si, lit]):
@@ -117,7 +119,7 @@ def _radiosity_of_iris(frame: Frame, si: SurfaceInteraction, lit: mi.Float) -> m
     return radiosity
 
 
-def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
+def _mirrored(frame: DeviceFrame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
     """Compute the radiance that wet surfaces mirror to the camera, except that of the lamps.
 
     The clear front cornea mirrors the ambient light and the surfaces around it. Elsewhere the tear film mirrors the
@@ -143,7 +145,7 @@ def _mirrored(frame: Frame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.Float:
 
 
 def _mirror_of_scene(
-    frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
+    frame: DeviceFrame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
     """Compute the radiance of skin mirrored by the cornea; `seen` where a ray meets nothing."""
     hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
@@ -156,7 +158,7 @@ def _mirror_of_scene(
 
 @syntax
 def _mirror_of_plane(
-    frame: Frame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
+    frame: DeviceFrame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
     """Compute the radiance of the background's plane mirrored by the cornea; `seen` where a ray misses it."""
     t = (frame.backdrop_x - start.x) / dr.select(way.x < -1e-4, way.x, -1)

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..hits.primary import TriangleHit, region_hit
-from ..records.frame import Frame, aligned_copy
+from ..records.frame import DeviceFrame, aligned_copy
 from ..records.recording import recorded
 from .hostdata import FINE, PLAIN
 from .sampling import FilmRequest, Pattern, Pixels, Samples
@@ -143,7 +143,7 @@ def trace_region(request: FilmRequest, pattern: Pattern, groups: GroupPass, coun
 
 
 @recorded
-def _trace(frame: Frame, pattern: Pattern, lanes: _Lanes, groups: GroupPass) -> TriangleHit:
+def _trace(frame: DeviceFrame, pattern: Pattern, lanes: _Lanes, groups: GroupPass) -> TriangleHit:
     """Trace one sample per lane."""
     pixel, k, fine = lanes.samples(groups)
     samples = Samples.of(*groups.pixels.at(pixel), pattern, fine)

@@ -13,7 +13,7 @@ from ...region.iris import WIDTH_MM, DrawnPattern, iris_maps
 from ...region.look import LIMBAL_RING, Look
 from ...region.mapcache import kept
 from ...region.texture import sclera_texture
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 
 GLOBE_EDGE = 0.6 * float(np.pi)  # polar angle at the edge of the globe's maps
 _WIDE_MM = 2.5  # width of an iris whose relief has its full height
@@ -51,7 +51,7 @@ class Textures:
         return cls(iris=iris, heights=heights, raised=raised, sclera=sclera)
 
 
-def limbal_radius(frame: Frame, local: mi.Vector3f) -> mi.Float:
+def limbal_radius(frame: DeviceFrame, local: mi.Vector3f) -> mi.Float:
     """Compute the radius (mm) of points (front cornea's frame) about its axis, heights divided by the limbus' aspect.
 
     All points of the visible limbus then have the radius of the limbus.
@@ -60,20 +60,20 @@ def limbal_radius(frame: Frame, local: mi.Vector3f) -> mi.Float:
     return dr.sqrt(local.y * local.y + local.z * local.z + frame.limbus.lowering * up * up)
 
 
-def opacity(frame: Frame, rho: mi.Float) -> mi.Float:
+def opacity(frame: DeviceFrame, rho: mi.Float) -> mi.Float:
     """Compute the opacity of the cornea's rim at a `limbal_radius`: a smooth step up to the limbus."""
     s = dr.clip((rho - frame.limbus.radius) * frame.limbus.gain + 1, 0, 1)
     return s * s * (3 - 2 * s)
 
 
-def stop_coordinates(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+def stop_coordinates(frame: DeviceFrame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Compute coordinates of points of the stop's plane along its semi-axes, in units of their lengths."""
     q = x - frame.stop.centre
     a, b = frame.stop.axes
     return dr.dot(q, frame.stop.u) / a, dr.dot(q, frame.stop.v) / b
 
 
-def _iris_place(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+def _iris_place(frame: DeviceFrame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
     """Compute polar coordinates on the iris: share of the way margin to root, turn, distance to the root, width."""
     pu, pv = stop_coordinates(frame, x)
     a, b = frame.stop.axes
@@ -88,7 +88,7 @@ def _on_iris(texture: mi.Texture2f, s: mi.Float, turn: mi.Float) -> mi.Float:
     return texture.eval(mi.Point2f(turn, (1 + s * (rows - 2)) / rows))[0]
 
 
-def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
+def iris_height(frame: DeviceFrame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float:
     """Compute the iris height (mm) above points of its plane from the height map; 0 in the pupil and beyond the root.
 
     The pattern stretches with the iris. A narrow iris is as steep as a wide one, so its heights are smaller.
@@ -99,7 +99,7 @@ def iris_height(frame: Frame, heights: mi.Texture2f, x: mi.Vector3f) -> mi.Float
     return dr.select((s > 0) & (left > 0), bulge + pattern, 0)
 
 
-def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
+def iris_albedo(frame: DeviceFrame, x: mi.Vector3f) -> mi.Float:
     """Compute the albedo in the plane of the iris outside the pupil: texture to the root, limbal tissue beyond it."""
     s, turn, left, _ = _iris_place(frame, x)
     texture = _on_iris(frame.textures.iris, s, turn)
@@ -109,7 +109,7 @@ def iris_albedo(frame: Frame, x: mi.Vector3f) -> mi.Float:
     return dr.select(left > 0, albedo, frame.limbus.albedo)
 
 
-def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
+def globe_map(frame: DeviceFrame, point: mi.Vector3f) -> mi.Point2f:
     """Map points of the globe (eye frame) to [0, 1]^2, in the azimuthal equidistant map of its front."""
     r = point - frame.sclera.centre
     polar = dr.acos(dr.clip(dr.normalize(r).x, -1, 1)) / GLOBE_EDGE
@@ -117,7 +117,7 @@ def globe_map(frame: Frame, point: mi.Vector3f) -> mi.Point2f:
     return mi.Point2f(0.5 + 0.5 * polar * r.y * inv, 0.5 + 0.5 * polar * r.z * inv)
 
 
-def sclera_albedo(frame: Frame, point: mi.Vector3f) -> mi.Float:
+def sclera_albedo(frame: DeviceFrame, point: mi.Vector3f) -> mi.Float:
     """Compute the albedo of the sclera at points of the globe (eye frame), with the grey ring of the limbus."""
     texture = frame.textures.sclera.eval(globe_map(frame, point))[0]
     sclera = frame.sclera.albedo * dr.maximum(1 + frame.sclera.contrast * (texture - 1), 0.02)

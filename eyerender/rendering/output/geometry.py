@@ -25,7 +25,7 @@ from ..hits.eyeshape import EyeShape
 from ..hits.primary import behind, facing, hit_before
 from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
-from ..records.frame import Frame, aligned_copy
+from ..records.frame import DeviceFrame, aligned_copy
 from ..records.job import RenderJob
 from ..records.recording import recorded
 from ..scene.region import RegionScene
@@ -118,7 +118,7 @@ def window_hits(bound: BoundFrame, job: RenderJob, scene: object) -> Callable[[]
 
 @recorded
 def _hits(
-    frame: Frame, pixels: Pixels, count: int, codes: mi.UInt8 | None, wanted: tuple[bool, bool]
+    frame: DeviceFrame, pixels: Pixels, count: int, codes: mi.UInt8 | None, wanted: tuple[bool, bool]
 ) -> tuple[tuple[mi.Vector3f, mi.Vector3f] | None, mi.Vector3f | None, tuple[mi.UInt8, mi.UInt8, mi.UInt8, mi.Bool]]:
     """Return points with normals, and places in the plane of the iris, if wanted; the other attributes of `Hits`.
 

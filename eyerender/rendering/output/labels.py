@@ -18,7 +18,7 @@ from ..hits.meniscus import on_water
 from ..hits.primary import first_hit, hidden
 from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import recorded, syntax
 from ..transport.directlight import direct_light, lamp_blocked
 
@@ -59,7 +59,7 @@ def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
 
 
 @recorded
-def _parts(frame: Frame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
+def _parts(frame: DeviceFrame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
     """Return the parts at the pixels' centres, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
@@ -93,7 +93,7 @@ def highlights(bound: BoundFrame, window: Window) -> Bools:
     return frozen(marked.reshape(window[3], window[2]), np.bool_)
 
 
-def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[mi.Float, mi.Float, mi.Float]:
+def _lamps_at(frame: DeviceFrame, window: Window, right: float, down: float) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Compute mirrored and scattered radiance of lamps at offsets (px) from pixel centres, and the pixel's share."""
     u, v = Pixels.of(window).at(dr.arange(mi.UInt32, window[2] * window[3]))
     right_of, below = (dr.opaque(mi.Float, x) for x in (right, down))
@@ -110,7 +110,9 @@ def _lamps_at(frame: Frame, window: Window, right: float, down: float) -> tuple[
 
 
 @syntax
-def _shine(frame: Frame, si: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f]) -> tuple[mi.Float, mi.Float]:
+def _shine(
+    frame: DeviceFrame, si: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f]
+) -> tuple[mi.Float, mi.Float]:
     """Compute the radiance of all lamps that points mirror, and the irradiance; `mirror` as in `direct_light`."""
     shine, irradiance, k = mi.Float(0), mi.Float(0), mi.UInt32(0)
     while dr.hint(k < frame.lights.count, label="highlights", exclude=[frame, si, mirror]):

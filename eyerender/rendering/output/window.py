@@ -14,7 +14,7 @@ from ...rig import defocus, exposure, psf, stray
 from ...rig.camera import PinholeCamera, Window
 from ...rig.imaging import Lens
 from ..glints.splatting import Mirrored, Shine, add_shines
-from ..glints.tracing import GlintTable, Spots
+from ..glints.tracing import GlintTable, LampSpots
 from ..records.job import RenderJob
 from ..scene.blur import Blur
 from .geometry import Geometry, Hits, geometry_of
@@ -158,7 +158,7 @@ class RawFrame(ArrayValue):
         shines = [
             replace(
                 shine,
-                spots=Spots(frozen((shine.spots.xy_px + 0.5) / side - 0.5), frozen(shine.spots.energy / side**2)),
+                spots=LampSpots(frozen((shine.spots.xy_px + 0.5) / side - 0.5), frozen(shine.spots.energy / side**2)),
                 blur_px=shine.blur_px / side,
             )
             for shine in glints

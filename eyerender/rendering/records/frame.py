@@ -19,7 +19,7 @@ from ...base.arrays import Floats, Reals, Singles
 from .job import LampTable
 from .parameters import FrameParameters, Kind, Parameters, packed, rebuilt
 from .recording import recorded, syntax
-from .surfaces import Surface
+from .surfaces import DeviceSurface
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 SMALL = 0.02  # radius over distance of lamps whose shadows of hairs are finer than a pixel
@@ -128,7 +128,7 @@ class Caches:
 
 
 @dataclass(kw_only=True)
-class Frame(FrameParameters):
+class DeviceFrame(FrameParameters):
     """A frame on the device: its parameters, and everything else that kernels read.
 
     Attributes:
@@ -144,7 +144,7 @@ class Frame(FrameParameters):
 
     structure: Structure
     boundary: PupilBoundary
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[DeviceSurface, ...]
     caches: Caches
     lights: Any = None
     textures: Any = None
@@ -155,7 +155,7 @@ class Frame(FrameParameters):
     @classmethod
     def upload(
         cls, structure: Structure, parameters: Parameters, waves: Floats, tables: Sequence[Singles | None]
-    ) -> Frame:
+    ) -> DeviceFrame:
         """Copy the numbers of a frame to the device; its other parts are set afterwards.
 
         Args:
@@ -173,7 +173,7 @@ class Frame(FrameParameters):
         sent_parameters = rebuilt(parameters, leaf)
         others = {f.name: getattr(sent_parameters, f.name) for f in fields(Parameters)}
         surfaces = tuple(
-            Surface(
+            DeviceSurface(
                 s.origin, s.axes, s.shape, s.eta, kind, None if table is None else mi.Float(aligned_copy(table)), s.film
             )
             for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
@@ -181,7 +181,7 @@ class Frame(FrameParameters):
         boundary = PupilBoundary.upload(waves)
         return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, caches=Caches())
 
-    def bare(self) -> Frame:
+    def bare(self) -> DeviceFrame:
         """Return the frame without lamps, textures and light, for recordings that remain valid when these change."""
         return replace(self, lights=None, textures=None, caches=Caches())
 
@@ -262,17 +262,17 @@ class Lights:
         count, suns = (dr.opaque(mi.UInt32, n) for n in (len(table), table.suns if sharp else 0))
         return cls(count=count, suns=suns, rows=upload_array(rows))
 
-    def __getitem__(self, i: mi.UInt32) -> Lamp:
+    def __getitem__(self, i: mi.UInt32) -> DeviceLamp:
         # Four numbers are gathered at once.
         a, b, c = (dr.gather(mi.Vector4f, self.rows, i * (_LIGHT_ROW // 4) + k) for k in range(3))
-        return Lamp(
+        return DeviceLamp(
             position=mi.Vector3f(a.x, a.y, a.z), axis=mi.Vector3f(a.w, b.x, b.y), radius=b.z, intensity=b.w,
             exponent=c.x, inner_radius=c.y, number=i,
         )  # fmt: skip
 
 
 @dataclass(kw_only=True)
-class Lamp:
+class DeviceLamp:
     """One LED on the device: I(w) = intensity * max(0, cos)^exponent, emitted by an annulus across its axis."""
 
     position: mi.Vector3f

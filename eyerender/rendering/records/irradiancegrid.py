@@ -95,14 +95,14 @@ class IrradianceGrid:
         dr.eval(cells)
         return cls(side=side, cells=cells, left=left), elsewhere, known
 
-    def place(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> Place:
+    def place(self, u: mi.Float, v: mi.Float, active: mi.Bool) -> GridPlace:
         """Return the grid places of points given in units of the node spacing."""
         inside = active & (u >= 0) & (v >= 0) & (u < self.side - 1) & (v < self.side - 1)
         i, j = mi.UInt32(u), mi.UInt32(v)
         across, down = (cubic_weights(p - mi.Float(n)) for p, n in ((u, i), (v, j)))
-        return Place(cell=j * self.side + i, across=mi.Vector4f(*across), down=mi.Vector4f(*down), inside=inside)
+        return GridPlace(cell=j * self.side + i, across=mi.Vector4f(*across), down=mi.Vector4f(*down), inside=inside)
 
-    def at(self, place: Place) -> tuple[mi.Float, mi.UInt32]:
+    def at(self, place: GridPlace) -> tuple[mi.Float, mi.UInt32]:
         """Interpolate the irradiance (mW/mm^2) at places; also return the lamps it lacks (outside the grid: all)."""
         total = mi.Float(0)
         for k in range(4):
@@ -113,7 +113,7 @@ class IrradianceGrid:
 
 
 @dataclass(kw_only=True)
-class Place:
+class GridPlace:
     """A position in a grid: its cell, the weights of its four columns and rows of nodes, and whether it is inside."""
 
     cell: mi.UInt32

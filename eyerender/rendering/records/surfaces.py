@@ -63,7 +63,7 @@ class NormalForm(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class DeviceSurface:
     """One refracting surface; every number is a Dr.Jit array of size one.
 
     Attributes:

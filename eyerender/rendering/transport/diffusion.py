@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...optics.diffusion import rings, transmitted
-from ..records.frame import Frame, aligned_copy, quotient
+from ..records.frame import DeviceFrame, aligned_copy, quotient
 from ..records.job import LampTable, RenderJob
 from ..records.recording import recorded, syntax
 from ..scene.diffusiongrids import SIDE, WIDTH, DiffusionGrids
@@ -66,7 +66,7 @@ class DiffusedLight:
 
     @classmethod
     def build(
-        cls, frame: Frame, job: RenderJob, lamps: LampTable, place: RegionScene, cells: DiffusionGrids
+        cls, frame: DeviceFrame, job: RenderJob, lamps: LampTable, place: RegionScene, cells: DiffusionGrids
     ) -> DiffusedLight:
         """Compute the light on the tissues of a frame.
 
@@ -103,18 +103,18 @@ class DiffusedLight:
         cells = self.size.cells(*self.size.place(u, v), 1)
         return lambda lamp: dr.clip(cells.interpolate(mi.Float, self.skin_seen, self.lamps, lamp), 0, 1)
 
-    def at_globe(self, frame: Frame, x: mi.Vector3f) -> mi.Float:
+    def at_globe(self, frame: DeviceFrame, x: mi.Vector3f) -> mi.Float:
         """Interpolate the irradiance (mW/mm^2) at points of the globe (eye frame)."""
         return globe_cells(*_place_on_globe(frame, x)).interpolate(mi.Float, self.globe)
 
-    def lamps_at_globe(self, frame: Frame, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
+    def lamps_at_globe(self, frame: DeviceFrame, x: mi.Vector3f) -> Callable[[mi.UInt32], mi.Float]:
         """Return a function of a lamp's number: the share of the lamp that points of the globe (eye frame) see."""
         row, column = (mi.UInt32(dr.clip(p + 0.5, 0, SIDE - 1)) for p in _place_on_globe(frame, x))
         first = (row * SIDE + column) * self.lamps
         return lambda lamp: dr.gather(mi.Float, self.globe_seen, first + lamp)
 
 
-def _place_on_globe(frame: Frame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+def _place_on_globe(frame: DeviceFrame, x: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """Return the row and column of points of the globe (eye frame) in the grid over it."""
     return globe_place(frame.vector_to_scene(x - frame.sclera.centre))
 
@@ -213,7 +213,7 @@ def spread_in_globe(grid: GlobeGrid, radius_mm: mi.Float, irradiance: mi.Float, 
     return light
 
 
-def join_tissues(frame: Frame, grid: SheetGrid, skin: mi.Float, globe: mi.Float) -> mi.Float:
+def join_tissues(frame: DeviceFrame, grid: SheetGrid, skin: mi.Float, globe: mi.Float) -> mi.Float:
     """Blend the light of the conjunctiva with that of the globe below it where it is thin; return that of the sheet."""
     index, columns = grid.cells[0], grid.size.columns
     row, column = index // columns, index % columns

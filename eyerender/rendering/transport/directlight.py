@@ -12,14 +12,14 @@ from ..hits.interaction import EPSILON_MM, SurfaceInteraction
 from ..hits.primary import ray_blocked, segment
 from ..materials.albedo import limbal_radius, opacity
 from ..materials.gloss import sheen
-from ..records.frame import ALL, BITS, Frame, Lamp
+from ..records.frame import ALL, BITS, DeviceFrame, DeviceLamp
 from ..records.recording import syntax
-from ..records.surfaces import Surface
+from ..records.surfaces import DeviceSurface
 from .manifold import Target, connect
 
 
 def lamp_blocked(
-    frame: Frame, x: mi.Vector3f, lamp: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool, active: mi.Bool
+    frame: DeviceFrame, x: mi.Vector3f, lamp: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool, active: mi.Bool
 ) -> mi.Bool:
     """Return whether anything stands between a point of the eye frame and a lamp.
 
@@ -37,7 +37,7 @@ def lamp_blocked(
 
 @syntax
 def _eye_blocks(
-    frame: Frame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
+    frame: DeviceFrame, x: mi.Vector3f, d: mi.Vector3f, distance: mi.Float, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Bool:
     """Return whether the eye blocks rays from points x along d (see `EyeShape.ray_test`); most miss it by far."""
     r = x - frame.sclera.centre
@@ -55,7 +55,10 @@ def _eye_blocks(
 
 
 def direct_light(
-    lamp: Lamp, source: mi.Vector3f, view: SurfaceInteraction, mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None
+    lamp: DeviceLamp,
+    source: mi.Vector3f,
+    view: SurfaceInteraction,
+    mirror: tuple[mi.Vector3f, mi.Vector3f] | None = None,
 ) -> tuple[mi.Float, mi.Float]:
     """Compute the unshadowed light of a lamp at matte points in air.
 
@@ -76,7 +79,7 @@ def direct_light(
     return received, mi.Float(0) if mirror is None else received * sheen(mirror[0], to, mirror[1], view.gloss)
 
 
-def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
+def irradiance(lamp: DeviceLamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vector3f) -> mi.Float:
     """Compute the unshadowed irradiance (mW/mm^2) of points x from a lamp's point `source`."""
     to = source - x
     inv2 = dr.rcp(dr.squared_norm(to))
@@ -87,7 +90,7 @@ def irradiance(lamp: Lamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi.Vecto
 
 @syntax
 def irradiance_at(
-    frame: Frame,
+    frame: DeviceFrame,
     x: mi.Vector3f,
     normal: mi.Vector3f,
     u: mi.Float,
@@ -126,14 +129,14 @@ def irradiance_at(
     return total, free
 
 
-def shadowless(frame: Frame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool) -> mi.Bool:
+def shadowless(frame: DeviceFrame, lamp: mi.UInt32, x: mi.Vector3f, on_sheet: mi.Bool) -> mi.Bool:
     """Return whether the shadow maps exclude anything between points of the sheet (scene's frame) and a lamp."""
     maps = frame.caches.shadow_maps
     return mi.Bool(False) if maps is None else maps.at(lamp, x, on_sheet)
 
 
 @syntax
-def onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
+def onto_matte(frame: DeviceFrame, view: SurfaceInteraction, u: mi.Float, v: mi.Float, wanted: mi.Bool) -> mi.Float:
     """Compute the direct irradiance (mW/mm^2) of the first surface of a bare eye from all lamps, where `wanted`.
 
     `u` and `v` are coordinates on each lamp's disc, [0, 1).
@@ -154,13 +157,13 @@ def onto_matte(frame: Frame, view: SurfaceInteraction, u: mi.Float, v: mi.Float,
 
 @syntax
 def irradiance_through_cornea(
-    frame: Frame,
+    frame: DeviceFrame,
     inner: mi.Vector3f,
     inside: mi.Bool,
     u: mi.Float,
     v: mi.Float,
     normal: mi.Vector3f | None = None,
-    surfaces: tuple[Surface, ...] | None = None,
+    surfaces: tuple[DeviceSurface, ...] | None = None,
 ) -> tuple[mi.Float, mi.UInt32]:
     """Compute the irradiance (mW/mm^2) of all lamps at points behind the cornea, and count failed paths.
 
@@ -195,7 +198,9 @@ def irradiance_through_cornea(
 
 
 @syntax
-def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Float:
+def irradiance_off_cornea(
+    frame: DeviceFrame, x: mi.Vector3f, normal: mi.Vector3f, u: mi.Float, v: mi.Float
+) -> mi.Float:
     """Compute the irradiance (mW/mm^2) of points outside the eye (eye frame) from lamps mirrored by the cornea.
 
     (u, v) is the position on each lamp's disc, [0, 1)^2.
@@ -217,7 +222,7 @@ def irradiance_off_cornea(frame: Frame, x: mi.Vector3f, normal: mi.Vector3f, u: 
     return total
 
 
-def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
+def behind(surface: DeviceSurface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
     """Return whether points (eye frame) are behind a surface, or at most `ahead_mm` in front of it.
 
     Only such points receive light through the surface. The outer iris may not: in a shallow chamber, the cornea ends
@@ -229,7 +234,7 @@ def behind(surface: Surface, x: mi.Vector3f, ahead_mm: float = 0.0) -> mi.Bool:
     return met & (t < away + ahead_mm)
 
 
-def image_of(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
+def image_of(frame: DeviceFrame, x: mi.Vector3f) -> mi.Vector3f:
     """Return the Gaussian images of points behind the cornea, near the stop, as seen from outside (eye frame).
 
     A straight line from a lamp must aim there to be refracted to the point.
@@ -237,7 +242,7 @@ def image_of(frame: Frame, x: mi.Vector3f) -> mi.Vector3f:
     return mi.Vector3f(x.x + frame.image.shift, x.y * frame.image.scale, x.z * frame.image.scale)
 
 
-def on_relief(frame: Frame, view: SurfaceInteraction) -> SurfaceInteraction:
+def on_relief(frame: DeviceFrame, view: SurfaceInteraction) -> SurfaceInteraction:
     """Return the view with the points where the rays meet the iris relief, as their feet in its plane."""
     if frame.caches.relief is None:
         return view
@@ -268,13 +273,13 @@ class LampPath:
     @classmethod
     def find(
         cls,
-        frame: Frame,
-        lamp: Lamp,
+        frame: DeviceFrame,
+        lamp: DeviceLamp,
         source: mi.Vector3f,
         inner: mi.Vector3f,
         active: mi.Bool,
         normal: mi.Vector3f | None = None,
-        surfaces: tuple[Surface, ...] | None = None,
+        surfaces: tuple[DeviceSurface, ...] | None = None,
         ahead_mm: float = 0.0,
     ) -> LampPath:
         """Solve for the path from a lamp's point `source` to the point `inner` in the plane of the iris (eye frame).

@@ -17,7 +17,7 @@ from ...base.arrays import Floats, Ints, Reals, remembered
 from ..hits.interaction import SurfaceInteraction, outer_albedo
 from ..hits.primary import TriangleHit, appearance, intersect
 from ..materials.albedo import iris_albedo
-from ..records.frame import Frame, sequence
+from ..records.frame import DeviceFrame, sequence
 from .chamber import IRIS_RINGS
 from .chamber import TURNS as IRIS_TURNS
 from .framepatches import RAYS, FramePatches, PatchTables, gather_rows
@@ -141,7 +141,7 @@ def share_of(part: Floats, whole: Floats) -> Floats:
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1), 1.0)
 
 
-def trace_rays(frame: Frame, field: RadiosityField, tables: PatchTables, lanes: int) -> RayHits:
+def trace_rays(frame: DeviceFrame, field: RadiosityField, tables: PatchTables, lanes: int) -> RayHits:
     """Trace the rays of patches. Rays of outside patches come first; there may be more lanes than rays."""
     index, first = dr.arange(mi.UInt32, lanes), tables.rays_outside
     outside, inside = index < first, (index >= first) & (index < tables.rays)
@@ -172,7 +172,7 @@ def _pattern(normal: mi.Vector3f, ray: mi.UInt32) -> mi.Vector3f:
 
 
 def _meet(
-    frame: Frame, field: RadiosityField, tables: PatchTables, o: mi.Vector3f, d: mi.Vector3f, index: mi.UInt32
+    frame: DeviceFrame, field: RadiosityField, tables: PatchTables, o: mi.Vector3f, d: mi.Vector3f, index: mi.UInt32
 ) -> RayHits:
     """Compute the hits along rays with these numbers; `sky` and `free` are set to 0."""
     active = index < tables.rays
@@ -206,7 +206,7 @@ def _meet(
 
 
 def _patch_on_skin(
-    frame: Frame, tables: PatchTables, view: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f, s: mi.Float
+    frame: DeviceFrame, tables: PatchTables, view: SurfaceInteraction, hit: TriangleHit, d: mi.Vector3f, s: mi.Float
 ) -> tuple[mi.UInt32, mi.Bool, mi.Bool, mi.Bool]:
     """Return the hit patch of a region, if it sends light back, and if it is the sheet's outer or inner side."""
     face = frame.region.face(hit)
@@ -219,7 +219,7 @@ def _patch_on_skin(
 
 
 def _patch_on_background(
-    frame: Frame, field: RadiosityField, tables: PatchTables, view: SurfaceInteraction, at: mi.Vector3f,
+    frame: DeviceFrame, field: RadiosityField, tables: PatchTables, view: SurfaceInteraction, at: mi.Vector3f,
     s: mi.Float, t: mi.Float,
 ) -> tuple[mi.UInt32, mi.Bool]:  # fmt: skip
     """Return the hit patch of the background at points of the scene's frame, and whether it sends light back."""

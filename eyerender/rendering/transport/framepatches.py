@@ -48,7 +48,7 @@ _CLOSE_MM = 10.5  # distance from the cornea's centre to skin onto which it mirr
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Interior:
+class ChamberPatches:
     """The chamber of an eye, and everything about it that does not depend on the pose.
 
     Attributes:
@@ -68,7 +68,7 @@ class Interior:
     gain: Any
 
     @classmethod
-    def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> Interior:
+    def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> ChamberPatches:
         """Compute the interior for an eye with its pupil and a look; `halvings` sets the number of ray bundles."""
         chamber = chamber_of(eye, film_index)
         albedo = patch_albedo(eye, chamber, look)
@@ -175,7 +175,7 @@ class FramePatches:
 
     job: RenderJob
     globe: GlobePatches
-    interior: Interior
+    interior: ChamberPatches
     plan: RayPlan
     points: Floats
     normals: Floats
@@ -226,7 +226,7 @@ class Patches:
 
     def __init__(self) -> None:
         self._plans: Cache[RayPlan] = Cache()  # per subject
-        self._interiors: Cache[Interior] = Cache()
+        self._interiors: Cache[ChamberPatches] = Cache()
 
     def of(self, job: RenderJob, globe: GlobePatches, region: RegionScene | None) -> FramePatches:
         """Return the patches of a job, with those of its globe."""
@@ -236,12 +236,14 @@ class Patches:
             job=job, globe=globe, interior=self._interior(job), plan=plan, points=points, normals=normals, plane=plane
         )
 
-    def _interior(self, job: RenderJob) -> Interior:
+    def _interior(self, job: RenderJob) -> ChamberPatches:
         """Return the chamber of a job's eye; with light from afar, more outgoing rays are used."""
         ambient = job.ambient
         halvings = _HALVINGS[ambient.map is not None or ambient.irradiance_w_m2 > 0]
         film, look = job.film_index, job.look
-        return self._interiors.get((job.eye, film, look, halvings), lambda: Interior.of(job.eye, film, look, halvings))
+        return self._interiors.get(
+            (job.eye, film, look, halvings), lambda: ChamberPatches.of(job.eye, film, look, halvings)
+        )
 
     def _plan(self, region: RegionScene | None, globe: Globe) -> RayPlan:
         """Compute patches and rays with the eye straight ahead, so that no earlier pose changes an image."""

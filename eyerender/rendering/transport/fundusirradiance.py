@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...eye.fundus import CELLS, EDGE
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.recording import syntax
 from .directlight import LampPath
 
@@ -24,7 +24,7 @@ class FundusIrradiance:
     cells: mi.Float
 
     @classmethod
-    def build(cls, frame: Frame, factors: mi.Float | None) -> FundusIrradiance:
+    def build(cls, frame: DeviceFrame, factors: mi.Float | None) -> FundusIrradiance:
         """Fill the grid.
 
         Args:
@@ -46,7 +46,7 @@ class FundusIrradiance:
 
 
 @syntax
-def _radiance_of_cells(frame: Frame, factors: mi.Float) -> mi.Float:
+def _radiance_of_cells(frame: DeviceFrame, factors: mi.Float) -> mi.Float:
     """Sum the lamps' light at the cells: irradiance of the stop times return factor."""
     index = dr.arange(mi.UInt32, CELLS * CELLS)
     row = index // CELLS

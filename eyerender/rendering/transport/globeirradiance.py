@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from ..hits.interaction import SurfaceInteraction
 from ..materials.albedo import GLOBE_EDGE, globe_map
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.irradiancegrid import IrradianceGrid, grid_nodes
 from ..records.recording import recorded, syntax
 from .directlight import irradiance, lamp_blocked
@@ -43,7 +43,7 @@ class GlobeIrradiance:
 
     @classmethod
     @recorded
-    def build(cls, frame: Frame, reach: mi.Float, points: mi.UInt32, gridded: bool) -> GlobeIrradiance:
+    def build(cls, frame: DeviceFrame, reach: mi.Float, points: mi.UInt32, gridded: bool) -> GlobeIrradiance:
         """Fill the grids.
 
         Args:
@@ -75,7 +75,7 @@ class GlobeIrradiance:
         return cls(globe=globe, plane=plane, reach=reach)
 
     @syntax
-    def at(self, frame: Frame, view: SurfaceInteraction) -> tuple[mi.Float, mi.Bool]:
+    def at(self, frame: DeviceFrame, view: SurfaceInteraction) -> tuple[mi.Float, mi.Bool]:
         """Interpolate the irradiance (mW/mm^2) at visible points, and whether it is known (not on the cornea's rim)."""
         if dr.hint(view.other, exclude=[self, frame, view]):
             found, left = self._on_plane(frame, view)
@@ -84,19 +84,19 @@ class GlobeIrradiance:
         known = left == 0
         return dr.select(known, found, 0), known
 
-    def _on_plane(self, frame: Frame, view: SurfaceInteraction) -> tuple[mi.Float, mi.UInt32]:
+    def _on_plane(self, frame: DeviceFrame, view: SurfaceInteraction) -> tuple[mi.Float, mi.UInt32]:
         x, scale = frame.point_to_scene(view.point), _MIDDLE / self.reach
         before = view.other & (frame.camera.centre.x > frame.backdrop_x)
         return self.plane.at(self.plane.place(_MIDDLE + scale * x.y, _MIDDLE + scale * x.z, before))
 
-    def _on_globe(self, frame: Frame, view: SurfaceInteraction) -> tuple[mi.Float, mi.UInt32]:
+    def _on_globe(self, frame: DeviceFrame, view: SurfaceInteraction) -> tuple[mi.Float, mi.UInt32]:
         at = globe_map(frame, view.point)
         return self.globe.at(self.globe.place((_SIDE - 1) * at.x, (_SIDE - 1) * at.y, view.sclera))
 
 
 @syntax
 def _from_lamps(
-    frame: Frame, points: mi.UInt32, x: mi.Vector3f, normal: mi.Vector3f, *, sphere: mi.Bool, cornea: mi.Bool
+    frame: DeviceFrame, points: mi.UInt32, x: mi.Vector3f, normal: mi.Vector3f, *, sphere: mi.Bool, cornea: mi.Bool
 ) -> mi.Float:
     """Compute the irradiance of all lamps at points (eye frame); globe's sphere and cornea may block it.
 

@@ -18,8 +18,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..materials.albedo import STEEPEST, limbal_radius, opacity
-from ..records.frame import BITS, Frame, Lamp
-from ..records.irradiancegrid import BENT, IrradianceGrid, Place, unevenness
+from ..records.frame import BITS, DeviceFrame, DeviceLamp
+from ..records.irradiancegrid import BENT, GridPlace, IrradianceGrid, unevenness
 from ..records.recording import syntax
 from .directlight import LampPath, behind, image_of, lamp_blocked
 
@@ -49,7 +49,7 @@ class IrisIrradiance:
     paths: mi.Float
 
     @classmethod
-    def build(cls, frame: Frame, lamps: int, points: mi.UInt32) -> IrisIrradiance:
+    def build(cls, frame: DeviceFrame, lamps: int, points: mi.UInt32) -> IrisIrradiance:
         """Fill the grid over the plane of the iris.
 
         Args:
@@ -80,7 +80,7 @@ class IrisIrradiance:
 
     @syntax
     def at(
-        self, frame: Frame, x: mi.Vector3f, spot: tuple[mi.Float, mi.Float, mi.Float], active: mi.Bool
+        self, frame: DeviceFrame, x: mi.Vector3f, spot: tuple[mi.Float, mi.Float, mi.Float], active: mi.Bool
     ) -> tuple[mi.Float, mi.UInt32]:
         """Interpolate the irradiance (mW/mm^2) at points of the iris plane (eye frame); also return missing lamps.
 
@@ -102,7 +102,7 @@ class IrisIrradiance:
             lamps &= lamps - 1
         return total, left
 
-    def _path(self, frame: Frame, lamp: mi.UInt32, place: Place) -> tuple[mi.Float, mi.Vector3f]:
+    def _path(self, frame: DeviceFrame, lamp: mi.UInt32, place: GridPlace) -> tuple[mi.Float, mi.Vector3f]:
         """Interpolate the irradiance of a lamp if nothing but the rim attenuates it, and where its light enters."""
         first, numbers = lamp * _NODES + place.cell, [mi.Float(0) for _ in range(_NUMBERS)]
         for k in range(4):
@@ -116,7 +116,7 @@ class IrisIrradiance:
 
 @syntax
 def _blocked(
-    frame: Frame, lamp: Lamp, x: mi.Vector3f, entry: mi.Vector3f, spot: tuple[mi.Float, mi.Float, mi.Float],
+    frame: DeviceFrame, lamp: DeviceLamp, x: mi.Vector3f, entry: mi.Vector3f, spot: tuple[mi.Float, mi.Float, mi.Float],
     asked: mi.Bool,
 ) -> mi.Bool:  # fmt: skip
     """Return whether anything blocks the path from a spot of a lamp to points x, where `asked`.
@@ -132,7 +132,7 @@ def _blocked(
     return blocked
 
 
-def _half(frame: Frame) -> mi.Float:
+def _half(frame: DeviceFrame) -> mi.Float:
     """Return half the width of the grid, mm."""
     return frame.iris.root_radius + _SPARE_MM
 
@@ -156,7 +156,7 @@ def _rows(paths: mi.Float, node: mi.UInt32) -> list[mi.Vector4f]:
 
 @syntax
 def _at_nodes(
-    frame: Frame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32
+    frame: DeviceFrame, points: mi.UInt32, i: mi.UInt32, node: mi.UInt32
 ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
     """Compute the irradiance of lamps i at nodes, and their paths.
 
@@ -187,7 +187,7 @@ def _at_nodes(
     return dr.select(hidden, -1, total * each), dr.select(unknown, -1, whole * each), entry.y, entry.z
 
 
-def _free(frame: Frame, lamp: mi.UInt32, path: LampPath) -> mi.Bool:
+def _free(frame: DeviceFrame, lamp: mi.UInt32, path: LampPath) -> mi.Bool:
     """Return whether the shadow maps, if there are any, exclude anything near a path in front of the eye."""
     maps = frame.caches.shadow_maps
     return mi.Bool(True) if maps is None else maps.at(lamp, frame.point_to_scene(path.entry), path.whole > 0)

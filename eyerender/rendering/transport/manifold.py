@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..records.recording import syntax
-from ..records.surfaces import Bundle, Surface
+from ..records.surfaces import Bundle, DeviceSurface
 
 MAX_STEPS = 48
 _DARK_STEPS = 20  # the same for paths that have crossed the horizon; of 200,000 paths that exist, none took over 16
@@ -33,7 +33,7 @@ _BISECTIONS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Connection:
+class LampConnection:
     """A light path: irradiance per radiant intensity (mm^-2), entry point, and direction on leaving the lamp.
 
     `found` marks existing paths. `failed` marks those where Newton's method did not converge although it never left the
@@ -62,7 +62,7 @@ class Target:
 
 @syntax
 def connect(
-    surfaces: tuple[Surface, ...],
+    surfaces: tuple[DeviceSurface, ...],
     lamp: mi.Vector3f,
     target: Target,
     reach: mi.Float,
@@ -70,7 +70,7 @@ def connect(
     *,
     mirror: bool = False,
     ahead_mm: float = 0.0,
-) -> Connection:
+) -> LampConnection:
     """Solve for paths from `lamp` to `target` through all `surfaces`; points in the eye frame (mm).
 
     Args:
@@ -113,10 +113,10 @@ def connect(
         y = dr.select(on, after, y)
     found = mi.Bool(active) & (transfer > 0)
     failed = mi.Bool(active) & ~found & (steps >= MAX_STEPS) & ~dark
-    return Connection(transfer=transfer, entry=y, leaving=dr.normalize(y - lamp), found=found, failed=failed)
+    return LampConnection(transfer=transfer, entry=y, leaving=dr.normalize(y - lamp), found=found, failed=failed)
 
 
-def _refract_all(surfaces: tuple[Surface, ...], b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
+def _refract_all(surfaces: tuple[DeviceSurface, ...], b: Bundle) -> tuple[Bundle, mi.Float, mi.Bool]:
     """Refract a bundle at all surfaces in order: the bundle behind them, the transmittance, and success."""
     passed, ok = mi.Float(1), mi.Bool(True)
     for surface in surfaces:
@@ -141,7 +141,7 @@ def _newton_step(b: Bundle, miss: mi.Vector3f, ya: mi.Vector3f, yb: mi.Vector3f)
     return move * dr.minimum(1, _STEP_MM / dr.maximum(dr.norm(move), 1e-9)), det
 
 
-def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
+def _entry_guess(front: DeviceSurface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
     """Compute the first guess of the entry point: where the straight line to `aim` enters.
 
     Where that line misses the surface or enters at grazing incidence, the guess is the point whose normal halves the
@@ -159,7 +159,7 @@ def _entry_guess(front: Surface, lamp: mi.Vector3f, aim: mi.Vector3f) -> mi.Vect
     return front.vector_out(local) + front.origin
 
 
-def _mirror_guess(front: Surface, lamp: mi.Vector3f, x: mi.Vector3f) -> mi.Vector3f:
+def _mirror_guess(front: DeviceSurface, lamp: mi.Vector3f, x: mi.Vector3f) -> mi.Vector3f:
     """Compute the first guess of the point that mirrors a lamp to `x`: for a sphere, by bisection of directions.
 
     Of the last two points, the one nearer to the lamp is taken, because Newton's method must not start in its shadow.

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...base.arrays import Floats
-from ..records.frame import Caches, Frame, Lights, sequence
+from ..records.frame import Caches, DeviceFrame, Lights, sequence
 from ..records.recording import recorded, syntax
 from .chamber import IRIS, PATCHES
 from .directlight import irradiance, irradiance_at, irradiance_off_cornea, irradiance_through_cornea
@@ -107,7 +107,9 @@ def _mean(found: Sequence[Sequence[mi.Float]], width: int) -> Floats:
 
 
 @recorded
-def gather_light(frame: Frame, panels: Lights, field: RadiosityField, tables: PatchTables, lanes: Lanes) -> Gathered:
+def gather_light(
+    frame: DeviceFrame, panels: Lights, field: RadiosityField, tables: PatchTables, lanes: Lanes
+) -> Gathered:
     """Compute the direct light of all lamps on the patches of a frame, and trace the rays between the patches."""
     # Shadows of panels are found with rays alone.
     of_panels = replace(frame, lights=panels, caches=Caches(ambience=frame.caches.ambience))
@@ -128,7 +130,7 @@ def gather_light(frame: Frame, panels: Lights, field: RadiosityField, tables: Pa
     )  # fmt: skip
 
 
-def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, mi.Float]:
+def _ambient(frame: DeviceFrame, tables: PatchTables, count: int) -> tuple[mi.Float, mi.Float]:
     """Compute the irradiance of the outside patches from the soft and the hard part of the ambient light."""
     n = gather_rows(tables.outer, 6, dr.arange(mi.UInt32, count))
     soft, hard = frame.caches.ambience.soft_and_hard(mi.Vector3f(*n[:3]), mi.Vector3f(*n[3:]))
@@ -136,7 +138,9 @@ def _ambient(frame: Frame, tables: PatchTables, count: int) -> tuple[mi.Float, m
     return soft, hard
 
 
-def _onto_outer(frame: Frame, tables: PatchTables, first: mi.UInt32 | None, count: int) -> tuple[mi.Float, mi.Float]:
+def _onto_outer(
+    frame: DeviceFrame, tables: PatchTables, first: mi.UInt32 | None, count: int
+) -> tuple[mi.Float, mi.Float]:
     """Compute the irradiance of the outside patches from lamps, with and without shadows; `count` lanes.
 
     Points on the lamps' discs are numbered from `first`; without it, they are the middles.
@@ -153,7 +157,7 @@ def _onto_outer(frame: Frame, tables: PatchTables, first: mi.UInt32 | None, coun
     return found
 
 
-def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> mi.Float:
+def _off_cornea(frame: DeviceFrame, rows: mi.Float, first: mi.UInt32, count: int) -> mi.Float:
     """Compute the irradiance of patches from lamps mirrored by the cornea; disc points are numbered from `first`."""
     index = dr.arange(mi.UInt32, count)
     n = gather_rows(rows, 6, index)
@@ -164,7 +168,7 @@ def _off_cornea(frame: Frame, rows: mi.Float, first: mi.UInt32, count: int) -> m
     return lit
 
 
-def _inside(frame: Frame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
+def _inside(frame: DeviceFrame, rows: mi.Float, first: mi.UInt32) -> list[mi.Float]:
     """Compute the irradiance of the chamber's patches from lamps; disc points are numbered from `first`."""
 
     def of(begin: int, end: int, inner: bool) -> mi.Float:
@@ -198,7 +202,7 @@ def _bare_at_hits(lights: Lights, hits: RayHits) -> mi.Float:
 
 
 @syntax
-def _at_hits(frame: Frame, hits: RayHits, tables: PatchTables, count: int) -> mi.Float:
+def _at_hits(frame: DeviceFrame, hits: RayHits, tables: PatchTables, count: int) -> mi.Float:
     """Compute the irradiance from the lamps at points of the skin hit by rays of globe and chamber, else -1.
 
     In the narrow space between eye and lids, light comes from points close by and varies over a fraction of the

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...base.arrays import Bools, Floats, Ints
-from ..records.frame import Frame, Lights, upload_array
+from ..records.frame import DeviceFrame, Lights, upload_array
 from ..records.job import LampTable, RenderJob
 from ..scene.background import Background
 from ..scene.region import RegionScene
@@ -46,9 +46,15 @@ class PendingField:
 
     @classmethod
     def gather(
-        cls, cache: Patches, frame: Frame, job: RenderJob, lamps: LampTable, panels: LampTable, globe: GlobePatches,
+        cls,
+        cache: Patches,
+        frame: DeviceFrame,
+        job: RenderJob,
+        lamps: LampTable,
+        panels: LampTable,
+        globe: GlobePatches,
         place: Background | RegionScene,
-    ) -> PendingField:  # fmt: skip
+    ) -> PendingField:
         """Start computing the direct light on the patches of a frame, and the form factors between them.
 
         Args:

@@ -24,11 +24,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..materials.albedo import iris_height
-from ..records.frame import Frame
+from ..records.frame import DeviceFrame
 from ..records.job import RenderJob
 from ..records.parameters import StopParameters
 from ..records.recording import recorded, syntax
-from ..records.surfaces import Surface
+from ..records.surfaces import DeviceSurface
 from .directlight import LampPath, behind
 
 _COARSE = 20  # places across, at which the lamps' directions are computed
@@ -128,7 +128,7 @@ class IrisRelief:
 
     @classmethod
     def build(
-        cls, frame: Frame, shape: ReliefShape | None, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]
+        cls, frame: DeviceFrame, shape: ReliefShape | None, side: mi.UInt32, each: mi.UInt32, size: tuple[int, int]
     ) -> IrisRelief:
         """Compute the lamp light on the heights of an iris.
 
@@ -152,7 +152,7 @@ class IrisRelief:
         dr.eval(shades)
         return cls(count=side, raised=dr.opaque(mi.Bool, True), heights=shape.corners, shades=shades)
 
-    def hit(self, frame: Frame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+    def hit(self, frame: DeviceFrame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Compute where rays meet the relief, as the foot of that point in the plane (eye frame).
 
         Args:
@@ -167,7 +167,7 @@ class IrisRelief:
             z = grid.interpolate(self.heights, x + z * slant, active)
         return dr.select(active, x + z * slant, x)
 
-    def at(self, frame: Frame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def at(self, frame: DeviceFrame, x: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Return the q of the module's docstring at feet `x`."""
         active &= self.raised
         return dr.select(active, relief_grid(frame, self.count).interpolate(self.shades, x, active), 1)
@@ -189,14 +189,14 @@ class ReliefSize(NamedTuple):
         return cls(side, -(-side // _BLOCK), int(np.ceil((_REACH_MM * _SLANT * side / (2 * half_mm) + 2) / _BLOCK)))
 
 
-def relief_grid(frame: Frame, count: mi.UInt32) -> ReliefGrid:
+def relief_grid(frame: DeviceFrame, count: mi.UInt32) -> ReliefGrid:
     """Create the grid over the iris with the given number of nodes along a side."""
     return ReliefGrid(stop=frame.stop, half=frame.iris.root_radius + _SPARE_MM, count=count)
 
 
 @recorded
 def relief_shape(
-    frame: Frame, pattern: mi.Texture2f, side: mi.UInt32, about: mi.UInt32, size: ReliefSize
+    frame: DeviceFrame, pattern: mi.Texture2f, side: mi.UInt32, about: mi.UInt32, size: ReliefSize
 ) -> ReliefShape:
     """Compute the heights of an iris.
 
@@ -254,7 +254,7 @@ def _highest_nearby(heights: mi.Float, side: mi.UInt32, about: mi.UInt32, blocks
     return most
 
 
-def _arriving(frame: Frame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi.Float:
+def _arriving(frame: DeviceFrame, grid: ReliefGrid, each: mi.UInt32, lanes: int) -> mi.Float:
     """Compute E, E t_u, E t_v and E' for points of the lamps at coarse positions, in rows."""
     count = mi.UInt32(_COARSE)
     coarse = ReliefGrid(stop=grid.stop, half=grid.half, count=count)
@@ -337,7 +337,7 @@ def _rise(k: mi.UInt32) -> mi.Float:
 
 
 def _arrival(
-    surfaces: tuple[Surface, ...], source: mi.Vector3f, entry: mi.Vector3f, normal: mi.Vector3f
+    surfaces: tuple[DeviceSurface, ...], source: mi.Vector3f, entry: mi.Vector3f, normal: mi.Vector3f
 ) -> mi.Vector3f:
     """Compute the direction of light that arrives from `entry`, as lateral motion per mm along `normal`."""
     w = dr.normalize(entry - source)

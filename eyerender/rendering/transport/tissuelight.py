@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..hits.interaction import EPSILON_MM
-from ..records.frame import Frame, sequence
+from ..records.frame import DeviceFrame, sequence
 from ..records.recording import syntax
 from ..scene.diffusiongrids import SIDE
 from ..scene.region import SHEET_COLUMNS
@@ -43,7 +43,7 @@ class TissueScene:
         lamps: number of lamps, at least 1.
     """
 
-    frame: Frame
+    frame: DeviceFrame
     relief: mi.Float
     wide: mi.Bool
     skin_rays: mi.UInt32
@@ -99,7 +99,7 @@ def _flux_on_skin(scene: TissueScene, grid: SheetGrid) -> tuple[mi.Float, mi.Flo
     return flux, seen
 
 
-def _coarse_cells(frame: Frame, grid: SheetGrid) -> _Cells:
+def _coarse_cells(frame: DeviceFrame, grid: SheetGrid) -> _Cells:
     """Return the cells of a grid over the skin that is half as fine as `grid` in both directions."""
     index, columns = grid.cells[1], grid.size.columns // 2
     row, column = index // columns, index % columns
@@ -109,7 +109,7 @@ def _coarse_cells(frame: Frame, grid: SheetGrid) -> _Cells:
 
 
 def _skin_point(
-    frame: Frame, grid: SheetGrid, row: mi.UInt32, column: mi.UInt32, s: mi.Float, t: mi.Float
+    frame: DeviceFrame, grid: SheetGrid, row: mi.UInt32, column: mi.UInt32, s: mi.Float, t: mi.Float
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Compute the point and normal (scene's frame) at shares s and t of the way through a coarse cell, across and down.
 
@@ -224,7 +224,7 @@ def _lamp_on_globe(scene: TissueScene, index: mi.UInt32, i: mi.UInt32) -> tuple[
     return total * share, free * share
 
 
-def _globe_surface(frame: Frame, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+def _globe_surface(frame: DeviceFrame, n: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Compute the point and normal (eye frame) of the globe along directions (scene's frame) from its centre."""
     away = 8.0
     d = frame.vector_to_eye(n)
@@ -253,7 +253,7 @@ def _through_lids(scene: TissueScene, index: mi.UInt32, size: SheetSize, lit: mi
 
 
 def _next_surface(
-    frame: Frame, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool
+    frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, first: mi.Float, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
     """Compute the first hit along rays beyond a distance and within a lid's thickness; its t counts from the start."""
     ray = mi.Ray3f(mi.Point3f(o + first * d), d)

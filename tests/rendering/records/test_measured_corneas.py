@@ -56,12 +56,12 @@ def test_a_conic_as_a_measured_cornea_gives_its_picture(renderer, kind):
 def test_the_device_meets_the_surface_of_the_host(renderer, name):
     import mitsuba as mi
 
-    from eyerender.rendering.records.frame import Frame, Structure
+    from eyerender.rendering.records.frame import DeviceFrame, Structure
 
     eye = eye_with(SHAPES[name]).build()
     job = job_of(eye, remote_rig(), (0, 0, 8, 8))
     kinds = Structure(surfaces=(("measured", False), ("quadric", False)))
-    values = Frame.upload(kinds, parameters_of(job), np.zeros((0, 2)), tables(eye))
+    values = DeviceFrame.upload(kinds, parameters_of(job), np.zeros((0, 2)), tables(eye))
     rng = np.random.default_rng(2)
     y, z = rng.uniform(-4.0, 4.0, (2, 4000))
     ends = np.column_stack([eye.front[0].sag(y, z), y, z])
