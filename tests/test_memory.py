@@ -134,7 +134,13 @@ def dataset_of(path, count, size):
     plan = Plan.of(DatasetSpec.from_mapping(spec))
     (record,) = trace(plan.draw(0).build(), boundary_points=6).records()
     sums = {"bytes": 1, "sha256": ""}
-    done = {"schema": "eyerender/shard/1", "digest": plan.digest, "versions": {}, "cpu": "", "rejections": []}
+    done: dict[str, Any] = {
+        "schema": "eyerender/shard/1",
+        "digest": plan.digest,
+        "versions": {},
+        "cpu": "",
+        "rejections": [],
+    }
     done |= {"backend": {"name": "", "device": ""}, "given_up": [], "images_saturated": 0}
     path.mkdir()
     with open(path / "metadata.jsonl", "w", encoding="utf-8") as metadata:

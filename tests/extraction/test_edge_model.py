@@ -53,7 +53,7 @@ def test_distance_is_the_nearest_points():
     ellipse = Ellipse(np.array([50.0, 40.0]), np.array([30.0, 18.0]), 1.1)
     points = ellipse.scaled(1.0).points(40) + rng.normal(0.0, 3.0, (40, 2))
     model = EdgeModel(ellipse=ellipse, inner_dn=0.0, outer=np.array([1.0]), sigma_px=1.0)
-    _, (distance, *_) = boundary_terms(*points.T.copy(), model.numbers())
+    _, (distance, *_) = boundary_terms(points[:, 0].copy(), points[:, 1].copy(), model.numbers())
     outline = ellipse.points(200_000)
     nearest = np.array([np.hypot(*(outline - p).T).min() for p in points])
     np.testing.assert_allclose(np.abs(distance), nearest, atol=2e-5)
