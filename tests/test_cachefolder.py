@@ -159,7 +159,7 @@ def test_a_planted_cache_is_not_used_by_any_of_its_users(tmp_path):
         "from eyerender.region import mapcache\n"
         "_keep_kernels_private(); kernels = os.environ['DRJIT_CACHE_DIR']\n"
         "assert os.stat(kernels).st_mode & 0o777 == 0o700\n"
-        "from eyerender import jit\n"
+        "from eyerender.base import jit\n"
         "print([runtime_store(), pupil_labs_python(), mapcache.folder(), jit.FOLDER])\n"
         "function = jit.compiled()(lambda x: x + 1); assert function(1) == 2; print(function.stats.cache_path)\n"
         "print(kernels)"

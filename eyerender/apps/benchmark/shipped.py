@@ -76,7 +76,7 @@ def _interpreter(variable: str, name: str) -> Path | None:
 
 def _separate(python: Path | None, detector: str, script: str) -> Command:
     if python is None:
-        return Command(None, f"not set up; scripts/{script} makes its environment")
+        return Command(None, f"not set up; scripts/tools/{script} makes its environment")
     return Command((str(python), str(Path(__file__).with_name("separate.py")), detector))
 
 

@@ -106,7 +106,7 @@ def _clouds(parts: Sequence[BlignautPart]) -> list[Figure]:
     ]
 
 
-def _best_deg(outcomes: Sequence[blignaut.Outcome], calibration: str) -> float:
+def _best_deg(outcomes: Sequence[blignaut.FunctionErrors], calibration: str) -> float:
     found = blignaut.best(list(outcomes), calibration)
     return np.nan if found is None or found.mean_deg is None else found.mean_deg
 

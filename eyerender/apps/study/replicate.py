@@ -34,8 +34,8 @@ class GuestrinPart(ModelResults):
 class BlignautPart(ModelResults):
     """Results of one eye model: outcomes and feature clouds by (protocol, observer), the waterfall."""
 
-    outcomes: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
-    centred: dict[tuple[str, str], list[blignaut.Outcome]] = field(default_factory=dict)
+    outcomes: dict[tuple[str, str], list[blignaut.FunctionErrors]] = field(default_factory=dict)
+    centred: dict[tuple[str, str], list[blignaut.FunctionErrors]] = field(default_factory=dict)
     clouds: dict[tuple[str, str], Cloud] = field(default_factory=dict)
     waterfall: list[WaterfallStep] = field(default_factory=list)
 
@@ -149,12 +149,12 @@ def blignaut_part(eye: str, protocols: Sequence[str], observing: Observing) -> B
     return out
 
 
-def _blignaut_vectors(done: list[blignaut.Outcome]) -> dict[str, Floats]:
+def _blignaut_vectors(done: list[blignaut.FunctionErrors]) -> dict[str, Floats]:
     """Compute error vectors (n, 2) by function and calibration set."""
     return {f"{o.function} on {o.calibration}": o.vector_deg for o in done if len(o.error_deg)}
 
 
-def _best_means(done: list[blignaut.Outcome]) -> dict[str, float | None]:
+def _best_means(done: list[blignaut.FunctionErrors]) -> dict[str, float | None]:
     """Compute the mean error of the best function for each set."""
     found = {c: blignaut.best(done, c) for c in CALIBRATION_SETS}
     return {c: b.mean_deg if b else None for c, b in found.items()}

@@ -1,7 +1,8 @@
 """Frame parameters: the numbers that change from frame to frame, by name.
 
 Host and device use the same classes. On the host (`job.parameters_of`) the leaves are NumPy numbers in float64. On the
-device (`frame.Frame`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of Floats.
+device (`frame.DeviceFrame`) they are Dr.Jit arrays of size one: a Float, a Vector3f for three numbers, or a tuple of
+Floats.
 Nothing here depends on Mitsuba.
 """
 
