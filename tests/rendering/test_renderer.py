@@ -75,15 +75,18 @@ def test_later_frames_launch_the_kernels_of_the_first(backend):
     assert kernels(renderer, jobs) <= known
 
 
-def test_another_number_of_surfaces_has_kernels_of_its_own_and_keeps_them(renderer):
+def test_another_number_of_surfaces_has_kernels_of_its_own_and_keeps_them(backend):
+    from eyerender.rendering.renderer import Renderer
+
+    renderer = Renderer(backend, spp=16)  # a new one: nothing of these eyes is kept in it
     rig = remote_rig()
     first = kernels(renderer, [job_of(eye_of("E4"), rig, rig.window(64, 48))])
-    assert first != kernels(renderer, [job_of(eye_of("E2"), rig, rig.window(64, 48))])
+    assert not kernels(renderer, [job_of(eye_of("E2"), rig, rig.window(64, 48))]) <= first
     later = [
         job_of(eye_of("E4", pupil_mm=3.0), head_rig(), (9, 9, 32, 32), (4.0, 1.0)),
         job_of(eye_of("E3"), rig, rig.window(64, 48)),
     ]
-    assert kernels(renderer, later) == first
+    assert kernels(renderer, later) <= first
 
 
 def test_a_window_is_a_cut_of_a_larger_one(renderer):
