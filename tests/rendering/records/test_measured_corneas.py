@@ -149,12 +149,14 @@ def test_light_on_the_iris_behind_measured_corneas_against_a_forward_light_trace
     np.testing.assert_allclose(measured, expected, rtol=2e-3)
 
 
-def test_a_new_subject_compiles_no_kernel(renderer):
+def test_a_new_subject_compiles_no_kernel(backend):
     """Expansions and grids are one kind of surface to the device."""
+    from eyerender.rendering.renderer import Renderer
     from tests.rendering.test_renderer import kernels
 
+    renderer = Renderer(backend, spp=16)  # a new one: nothing of these eyes is kept in it
     rig = head_rig()
     eyes = [eye_with(shape).build() for shape in (*SHAPES.values(), grid_of(keratoconus, 5.0, 0.2))]
     jobs = [job_of(eye, rig, rig.window(64, 48)) for eye in eyes]
     first = kernels(renderer, jobs[:1])
-    assert kernels(renderer, jobs) == first
+    assert kernels(renderer, jobs) <= first
