@@ -367,7 +367,7 @@ def _item(
     try:
         for part in parts:
             item[part] = _value(part, line, picture)
-        return item | {key: line[key] for key in ("sample", "subject") if key in line}
+        return item | {key: line[key] for key in ("sample", "subject") if line.get(key) is not None}
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
 
@@ -414,13 +414,14 @@ def _lids(line: dict[str, Any]) -> torch.Tensor:
 
 
 def _glints(line: dict[str, Any]) -> torch.Tensor:
-    """Places (lights, 3) of the reflections in px of the image, and whether they are visible."""
-    window = line["window_px"]
-    out = []
-    for glint in line["labels"]["glints"]:
-        x, y = glint["xy_px"] or (math.nan, math.nan)
-        out.append([x - window["x0"], y - window["y0"], float(glint["visible"]) if glint["xy_px"] else math.nan])
-    return torch.tensor(out, dtype=torch.float32).reshape(-1, 3)
+    """Places (lights, 3) of the reflections in px of the image, and whether they are visible; NaN where none is."""
+    window, labels = line["window_px"], line["labels"]
+    out = torch.full((len(labels["lights_mm"]), 3), math.nan)
+    for glint in labels["glints"]:
+        if glint["xy_px"] is not None:
+            x, y = glint["xy_px"]
+            out[glint["light"]] = torch.tensor([x - window["x0"], y - window["y0"], float(glint["visible"])])
+    return out
 
 
 def _camera(line: dict[str, Any]) -> dict[str, Any]:

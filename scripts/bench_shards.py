@@ -57,7 +57,7 @@ def line_of(sample: int, subject: int, split: str) -> dict[str, Any]:
     own = {"sample": sample, "subject": subject, "split": split, "records": [{"eye": "right"}]}
     window = {"x0": 0, "y0": 0, "width": 16, "height": 16}
     return {
-        "schema": "eyerender/image/4",
+        "schema": "eyerender/image/5",
         "file_name": name,
         "window_px": window,
         **own,

@@ -88,7 +88,7 @@ def folder_of(path, count):
             frame, which = k // 2, k % len(lines)
             line: dict[str, Any] = {**lines[which], "file_name": f"images/{'even' if frame % 10 else which}.png"}
             line["records"][0]["frame"] = frame
-            file.write(json.dumps({"schema": "eyerender/image/3", **line}) + "\n")
+            file.write(json.dumps({"schema": "eyerender/image/5", **line}) + "\n")
     return path
 
 
@@ -152,7 +152,7 @@ def dataset_of(path, count, size):
                     subject, sequence = plan.subject_of(sample)
                     name = f"{shard:05d}/{sample:08d}-right.png"
                     line: dict[str, Any] = {
-                        "schema": "eyerender/image/4",
+                        "schema": "eyerender/image/5",
                         "file_name": f"images/{name}",
                         "mask_file_name": f"masks/{name}",
                     }

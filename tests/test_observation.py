@@ -96,16 +96,17 @@ def test_record_has_every_key_and_null_where_it_does_not_apply():
     records = list(observations().records())
     for record in records:
         assert list(record) == [
-            "schema", "frame", "fixation", "camera", "eye", "eye_model", "target_mm", "head_mm", "eye_position_mm",
-            "pose", "pupil", "glints",
+            "schema", "frame", "fixation", "camera", "eye", "eye_model", "subject", "instant", "time_s", "target_mm",
+            "head_mm", "eye_position_mm", "pose", "rig_pose", "events", "blink_phase", "pupil", "glints", "lens_glints",
+            "ghost_glints", "purkinje",
         ]  # fmt: skip
         assert list(record["pose"]) == ["azimuth_deg", "elevation_deg", "torsion_deg", "residual_mm"]
         assert list(record["pupil"]) == [
             "status", "reason", "in_image", "centre_px", "semi_axes_px", "angle_rad", "anatomical_centre_px",
-            "points_px", "covariance", "arcs_deg", "arc_ellipse",
+            "points_px", "covariance", "arcs_deg", "arc_ellipse", "time_s",
         ]  # fmt: skip
         for glint in record["glints"]:
-            assert list(glint) == ["light", "status", "reason", "in_image", "xy_px", "covariance"]
+            assert list(glint) == ["light", "status", "reason", "in_image", "xy_px", "covariance", "time_s"]
     assert records[1]["pupil"]["centre_px"] is None
     assert records[1]["pupil"]["reason"].startswith("coarse search")
     assert records[2]["glints"][0]["xy_px"] is None
@@ -162,7 +163,7 @@ def test_glint_of_light():
     ("change", "words"),
     [
         (lambda r: r.update(schema="other/1"), "records.0.schema: is 'other/1'"),
-        (lambda r: r.pop("schema"), "records.0.schema: missing; write 'eyerender/record/2'"),
+        (lambda r: r.pop("schema"), "records.0.schema: missing; write 'eyerender/record/3'"),
         (lambda r: r.update(frame=None), "records.0.frame: missing; number the frames of all records or of none"),
         (lambda r: r.update(pose=3), "records.0.pose: must be an object"),
         (lambda r: r.update(pupil=None), "records.0.pupil: must be an object"),
@@ -235,7 +236,7 @@ def test_null_keys_may_be_left_out():
 
 
 def test_the_least_that_a_record_may_hold():
-    schema = {"schema": "eyerender/record/2"}
+    schema = {"schema": "eyerender/record/3"}
     found = Observations.from_records(
         [
             {**schema, "pupil": {"centre_px": [3, 4]}, "glints": [{"light": 0, "xy_px": [5, 6]}, {"light": 1}]},

@@ -55,7 +55,7 @@ def test_labels_agree_with_the_pixels(folder):
         ys, xs = np.nonzero(mask == 3)
         centre = np.array([xs.mean(), ys.mean()]) + entry.window[:2]
         a, b = truth.pupil.semi_axes_px[row]
-        seen = entry.line["labels"]["pupil_visible_fraction"]
+        seen = entry.line["labels"]["pupil"]["visible_fraction"]
         # A mask of about 500 pixels has a centroid good to about .05 px, an area good to its outline's pixels.
         assert len(xs) == pytest.approx(seen * np.pi * a * b, rel=0.03)
         if seen == 1:

@@ -91,6 +91,7 @@ def features(
     camera_index: npt.ArrayLike,
     lights_mm: npt.ArrayLike,
     *,
+    lit: npt.ArrayLike = True,
     boundary_points: int = 30,
     purkinje: Sequence[int] = (1,),
 ) -> Features:
@@ -104,6 +105,7 @@ def features(
         cameras: distinct cameras.
         camera_index: (n,) the camera of each row.
         lights_mm: (m, 3) in the world.
+        lit: (n, m) whether a light lights the eye; if not, its images have status NONE.
         boundary_points: number of boundary points, >= 6.
         purkinje: orders of the requested images of each light; one that an eye lacks has status MISSED.
     """
@@ -117,19 +119,22 @@ def features(
     points, anatomical, ellipse = np.empty((n, k, 2)), np.empty((n, 2)), np.empty((n, 6))
     point_status, point_residual = np.empty((n, k), dtype=np.int8), np.empty((n, k))
     in_image = np.empty((n, k), dtype=bool)
-    glints, glint_residual = np.empty((n, m, p, 2)), np.empty((n, m, p))
-    glint_status, glint_in_image = np.empty((n, m, p), dtype=np.int8), np.empty((n, m, p), dtype=bool)
+    lit = np.broadcast_to(np.asarray(lit, dtype=bool), (n, m))
+    glints, glint_residual = np.full((n, m, p, 2), np.nan), np.full((n, m, p), np.nan)
+    glint_status, glint_in_image = np.full((n, m, p), Status.NONE, np.int8), np.zeros((n, m, p), dtype=bool)
     for group, rows in groups(eyes, which):
         for number in np.unique(cams[rows]):
             camera = cameras[number]
             for block, turned in chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
                 pose = Poses(poses.azimuth_rad[block], poses.elevation_rad[block], poses.torsion_rad[block])
                 view = View.of(turned, pose, position[block], camera)
-                for j, order in enumerate(purkinje if m else ()):
-                    exits, residual, status = glint_exits(turned, order, view.into_eye(lights), view.camera_mm)
+                some = np.flatnonzero(lit[block].any(axis=0))
+                for j, order in enumerate(purkinje if len(some) else ()):
+                    exits, residual, status = glint_exits(turned, order, view.into_eye(lights[some]), view.camera_mm)
                     pixels, status = view.project(exits, status)
-                    glints[block, :, j], glint_status[block, :, j] = pixels, status
-                    glint_residual[block, :, j], glint_in_image[block, :, j] = residual, camera.in_image(pixels)
+                    at, lamp = np.ix_(block, some)
+                    glints[at, lamp, j], glint_status[at, lamp, j] = pixels, status
+                    glint_residual[at, lamp, j], glint_in_image[at, lamp, j] = residual, camera.in_image(pixels)
                 for inner in slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
                     part, eye, near = block[inner], take_eyes(turned, np.arange(len(block))[inner]), view.rows(inner)
                     # The last point is the stop's centre.
@@ -141,6 +146,8 @@ def features(
                     ellipse[part, :2], ellipse[part, 2:4] = fit.centre_px, fit.semi_axes_px
                     ellipse[part, 4], ellipse[part, 5] = fit.angle_rad, fit.residual_px
                     in_image[part] = camera.in_image(pixels[:, :-1])
+    if not lit.all():
+        glints[~lit], glint_status[~lit], glint_in_image[~lit] = np.nan, Status.NONE, False
     results: list[npt.NDArray[Any]] = [points, point_status, point_residual, ellipse, anatomical, in_image]
     results += [glints, glint_status, glint_residual, glint_in_image]
     for array in results:

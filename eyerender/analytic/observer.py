@@ -125,6 +125,7 @@ class AnalyticObserver:
             scene.rig.cameras,
             index.camera,
             np.array([light.position_mm for light in scene.rig.lights]),
+            lit=scene.rig.lit(index.eye),
             boundary_points=self.boundary_points,
             purkinje=(1, *sorted(set(purkinje) - {1})),
         )
@@ -159,6 +160,8 @@ def purkinje_records(observed: Observations, seen: Features, orders: Sequence[in
     out = []
     for i, j, p in np.ndindex(seen.glint_status.shape):
         status = Status(int(seen.glint_status[i, j, p]))
+        if status == Status.NONE:
+            continue
         ok = status == Status.OK
         out.append(
             {
@@ -249,11 +252,11 @@ def glint_features(seen: Features) -> GlintFeatures:
     """Compute the glints (first Purkinje images) of a batch."""
     status = seen.glint_status[:, :, 0]
     reasons = np.full(status.shape, None, dtype=object)
-    for i, j in np.argwhere(status != Status.OK):
+    for i, j in np.argwhere((status != Status.OK) & (status != Status.NONE)):
         reasons[i, j] = Status(status[i, j]).reason
     return GlintFeatures(
         status=status,
-        light=np.broadcast_to(np.arange(status.shape[1]), status.shape),
+        light=np.where(status == Status.NONE, -1, np.arange(status.shape[1])),
         reason=reasons,
         in_image=seen.glint_in_image[:, :, 0] & (status == Status.OK),
         xy_px=seen.glints_px[:, :, 0],

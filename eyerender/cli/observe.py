@@ -39,6 +39,7 @@ def features(
     """
     # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver, purkinje_records
+    from ..imaging.labels import space_labels
 
     if points < 6:
         raise InputError("must be >= 6", source="--points")
@@ -46,11 +47,13 @@ def features(
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
     heed = Heed(strict)
     loaded = heed.scene(scene, eye=eye)
-    observed, seen = AnalyticObserver(points).observe_in_detail(loaded.frames(), purkinje=purkinje or (1,))
+    frames = loaded.frames()
+    observed, seen = AnalyticObserver(points).observe_in_detail(frames, purkinje=purkinje or (1,))
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
         "rig": loaded.rig.to_mapping(),
         "records": list(observed.records()),
+        "space": space_labels(frames, observed) if json is not None else [],
     }
     if purkinje:
         data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))

@@ -21,7 +21,7 @@ from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, n
 from ..imaging.labels import image_labels
 from ..rig.plausibility import is_saturated
 from .plan import Plan
-from .realise import Realised, Rejection, image_line, realise
+from .realise import Realised, Rejection, realise, sample_line
 
 if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
@@ -139,7 +139,7 @@ class Maker:
         for image in images:
             assert found.observations is not None
             labels = image_labels(image, found.observations)
-            name, line = image_line(found, image.row, self.frames, image.window, labels)
+            name, line = sample_line(found, image.row, self.frames, image.window, labels)
             kinds = self.plan.spec.labels.pictures
             pictures = {kind: _PICTURES[kind](image) for kind in kinds}
             yield MadeImage(name, pictures, line, is_saturated(image.counts, image.scene.spec.sensor))

@@ -35,7 +35,7 @@ from ..base.storage.files import (
     write_json,
 )
 from ..folders.imagefile import Writer
-from ..folders.imagefolder import DONE, IMAGE_SCHEMA, KINDS, LINES, SHARDS, STAGE, shard_name
+from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, STAGE, shard_name
 from .done import FILES, PACKED, cpu_family, described, picture_file, read_done_file, run_versions, sum_of
 from .maker import MadeSample
 from .packing import SHARD, pack, unpack
@@ -110,7 +110,7 @@ class PartialShard:
                 self._writer.put(self.stage / kind / file, picture)
                 self._new.append(f"{kind}/{file}")
             names = {KINDS[kind]: self._place(kind, file) for kind, file in files.items()}
-            line = {"schema": IMAGE_SCHEMA, **names, **image.line}
+            line = {**image.line, **names}
             self._add_line(sample.index, (json.dumps(line, allow_nan=False) + "\n").encode())
             self._saturated += [sample.index] * image.saturated
         self.made.add(sample.index)

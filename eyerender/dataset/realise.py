@@ -4,7 +4,7 @@ Attempt a of sample i draws every random value of the sample again. Grids and se
 design; a Sobol draw becomes a random one; the subject's identity stays. The first attempt that succeeds is the sample.
 After `attempts` failures, or at once if nothing random is left to draw, the sample is given up.
 
-`image_line` gives the metadata of one image of a sample.
+`sample_line` gives the metadata of one image of a sample.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from ..analytic.observer import trace
 from ..base.errors import EyerenderError, InputError, InputWarning
 from ..folders.outfolder import refuse_non_empty
 from ..imaging.capture import check_windows
-from ..population.table import default_table
-from ..rig.camera import Window, in_window
+from ..imaging.lines import image_line
+from ..rig.camera import Window, beyond_window
 from ..scene import Frames, Scene
 from ..scene.observation import EYES, Observations
 from .plan import Plan, Sample, is_function
@@ -178,7 +178,7 @@ def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, O
     check_windows(scene)
     posed = scene.frames()
     found = trace(posed, boundary_points=plan.spec.labels.boundary_points)
-    count = int(found.index.frame.max()) + 1
+    count = scene.frame_count
     if frames is not None and count != frames:
         raise InputError(f"has {count} frames, sample 0 has {frames}")
     if plan.spec.require == "pupil":
@@ -198,13 +198,13 @@ def frames_of(plan: Plan) -> int:
         InputError: sample 0 cannot be made at all.
     """
     first = realise(plan, 0)
-    if first.observations is None:
+    if first.scene is None:
         last = first.rejections[-1].reason if first.rejections else "no reason known"
         more = () if first.error is None else first.error.others
         others = [InputError(other.reason, source=plan.source, path=f"scene.{other.path}") for other in more]
         reason = f"sample 0 cannot be made ({len(first.rejections)} attempts): {last}"
         raise InputError(reason, source=plan.source, others=others)
-    return int(first.observations.index.frame.max()) + 1
+    return first.scene.frame_count
 
 
 def windows_of(scene: Scene, observations: Observations) -> list[Window]:
@@ -214,11 +214,16 @@ def windows_of(scene: Scene, observations: Observations) -> list[Window]:
 
 
 def _require_pupils(scene: Scene, found: Observations) -> None:
+    index = found.index
     for row, window in enumerate(windows_of(scene, found)):
+        camera = int(index.camera[row])
+        who = f"the {EYES[index.eye[row]]} eye in camera {camera} ({scene.rig.cameras[camera].name}), frame "
+        who += str(index.frame[row])
         if not found.pupil.ok[row]:
-            raise InputError(f"no apparent pupil: {found.pupil.reason[row]}")
-        if not in_window(window, found.pupil.points_px[row]).all():
-            raise InputError("the apparent pupil leaves the window")
+            raise InputError(f"no apparent pupil of {who}: {found.pupil.reason[row]}")
+        beyond = beyond_window(window, found.pupil.points_px[row])
+        if beyond > 0:
+            raise InputError(f"the apparent pupil of {who}, leaves the window by {beyond:.1f} px")
 
 
 def image_name(sample: int, frame: int, frames: int, side: str) -> str:
@@ -226,7 +231,7 @@ def image_name(sample: int, frame: int, frames: int, side: str) -> str:
     return f"{sample:08d}-{f'{frame:03d}-' if frames > 1 else ''}{side}"
 
 
-def image_line(
+def sample_line(
     found: Realised, row: int, frames: int, window: Window, labels: dict[str, Any]
 ) -> tuple[str, dict[str, Any]]:
     """Return name and metadata, without the names of its files, of observation `row` of a sample.
@@ -239,48 +244,28 @@ def image_line(
     assert observations is not None
     turn = sample.turn
     (record,) = observations.take([row]).records()
-    frame = record["frame"]
-    side = EYES[int(observations.index.eye[row])]
+    frame, instant, side = record["frame"], record["instant"], record["eye"]
     eye = sample.eye or scene.eye_file(side).to_mapping()
-    line = {
-        "sample": turn.sample,
+    # Numbers of frames and instants are unique in the whole dataset.
+    instants = frames // len(scene.rig.cameras)
+    record |= {
+        "frame": turn.sample * frames + frame,
+        "instant": turn.sample * instants + instant,
         "subject": turn.subject,
-        "split": sample.split,
-        "sequence_index": turn.sequence,
-        "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
-        "bit_depth": scene.spec.sensor.bit_depth,
-        "gamma": scene.spec.sensor.gamma,
-        # Keys of version 4 that no scene fills yet: time within the sequence, movements, and what the eye wears.
-        **dict.fromkeys(("time_s", "event", "rig_pose")),
-        # A frame's number is unique in the whole dataset.
-        "records": [{**record, "frame": turn.sample * frames + frame}],
-        "labels": labels,
-        "parameters": {
-            "eye_model": scene.eye_name,
-            "pupil_diameter_mm": scene.stop_diameter_mm(side),
-            "wavelength_nm": scene.spec.wavelength_nm,
-            "spp": scene.spec.image.spp,
-            "seed": scene.spec.seed,
-            "camera": int(observations.index.camera[row]),
+    }
+    line = image_line(
+        scene,
+        record,
+        window,
+        labels,
+        sample={"sample": turn.sample, "split": sample.split, "sequence_index": turn.sequence},
+        drawn={
             "attempt": turn.attempt,
             "subject_attempt": turn.subject_attempt,
             "draws": sample.draws,
-            "spectacles": None,
-            "contact_lens": None,
-            **_person(scene, side),
             # Stored as text, because their nested keys may differ between samples, which table columns do not allow.
             "scene_json": json.dumps(sample.scene, sort_keys=True),
             "eye_json": json.dumps({k: v for k, v in eye.items() if k != "sources"}, sort_keys=True),
         },
-    }
+    )
     return image_name(turn.sample, frame, frames, side), line
-
-
-def _person(scene: Scene, side: str) -> dict[str, Any]:
-    """Return the metadata `person`; its entrance pupil is that at the table's luminance, not that of the image."""
-    found: dict[str, Any] = scene.person_numbers(side)
-    if "entrance_pupil_mm" not in found.get("person", {}):
-        return found
-    luminance = default_table().constant("luminance_cd_m2")
-    named = {"entrance_pupil_mm": f"entrance_pupil_at_{luminance:g}_cd_m2_mm"}
-    return {"person": {named.get(key, key): value for key, value in found["person"].items()}}

@@ -208,7 +208,7 @@ class DatasetWriter:
         assert self._maker is not None
         frames = self._opened_run.frames
         if not self._is_checked:
-            found = int(self._plan.draw(sample).build().index().frame.max()) + 1
+            found = self._plan.draw(sample).build().frame_count
             if found != frames:
                 raise InputError(f"has {found} frames, not {frames}; give frames={found}", path="scene")
             self._is_checked = True

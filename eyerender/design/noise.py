@@ -29,6 +29,7 @@ from ..rig.light import Lamp
 from ..rig.rig import RigGeometry
 from ..rig.sensor import Sensor
 from ..scene import Scene
+from ..scene.observation import EYES
 
 FIXATION_DEG = 0.3
 """Noise of fixation on a target, per axis (chosen)."""
@@ -45,7 +46,8 @@ class FeatureNoise(ArrayValue):
 
     Attributes:
         outline_px: (cameras,) of one px of outline along its normal; outline_px / sqrt(l) for l px of outline.
-        glint_px: (cameras, lights) of a glint along each axis; inf if it cannot be located.
+        glint_px: (cameras, lights) of a glint along each axis; inf if it cannot be located or the light does not light
+            the eye.
         fixation_deg: of fixation on a target, per axis.
     """
 
@@ -78,7 +80,7 @@ def sensor_noise(
 ) -> FeatureNoise:
     """Compute the feature noise of a scene from its lamps, sensor and iris albedo, without rendering.
 
-    The levels are those of the first eye at its reference position, looking straight ahead.
+    The levels of a camera are those of the first eye that it sees, at its reference position, looking straight ahead.
 
     >>> (er.sensor_noise(er.load_scene("headset")).outline_px < 1).tolist()
     [True]
@@ -90,20 +92,22 @@ def sensor_noise(
     """
     rig, sensor = scene.rig, scene.spec.sensor
     lights = rig.lights if lights is None else lights
-    side = scene.spec.subject.eyes[0]
-    eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
-    # Lamps light a cornea that faces them with I / d^2.
-    irradiance = sum(intensity / distance**2 for intensity, _, distance in (lamp.towards(eye_mm) for lamp in lights))
-    radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
     blur = float(np.hypot(sensor.psf_sigma_px, 1.0 / np.sqrt(12.0)))
     read = read_noise_e(sensor)
-    outline, glint = np.empty(len(rig.cameras)), np.empty((len(rig.cameras), len(lights)))
+    outline, glint = np.empty(len(rig.cameras)), np.full((len(rig.cameras), len(lights)), np.inf)
     for k, camera in enumerate(rig.cameras):
+        side = next(filter(camera.sees, scene.spec.subject.eyes), scene.spec.subject.eyes[0])
+        eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+        lit = {j: lamp for j, lamp in enumerate(lights) if lamp.lights(EYES.index(side))}
+        # Lamps light a cornea that faces them with I / d^2.
+        towards = [lamp.towards(eye_mm) for lamp in lit.values()]
+        irradiance = sum(intensity / distance**2 for intensity, _, distance in towards)
+        radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
         dark = PUPIL_SHARE * iris
         edge = edge_information(dark, iris, blur, read, sensor.full_well_e)
         outline[k] = 1.0 / np.sqrt(edge) if edge > 0 else np.inf
-        for j, lamp in enumerate(lights):
+        for j, lamp in lit.items():
             energy, size = glint_energy(lamp, camera, eye_mm, sensor, scene.spec.wavelength_nm)
             spread = float(np.hypot(blur, size))
             glint[k, j] = glint_deviation(energy, spread, dark, read, sensor.full_well_e)

@@ -264,7 +264,9 @@ def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple
     if not len(views.rig.lights):
         return outline[:, :-1], outline_ok[:, :-1], np.empty((len(views), 0, 2)), np.empty((len(views), 0), dtype=bool)
     exits, _, status = glint_exits(eye, 1, view.into_eye(views.lights_mm), view.camera_mm)
-    return outline[:, :-1], outline_ok[:, :-1], *projected(exits, status)
+    glints, glint_ok = projected(exits, status)
+    lit = views.rig.lit((np.broadcast_to(eye.stop.handed, len(views)) < 0).astype(np.int64))
+    return outline[:, :-1], outline_ok[:, :-1], glints, glint_ok & lit
 
 
 def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | None = None) -> FeatureSlopes:

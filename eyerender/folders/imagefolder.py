@@ -29,8 +29,8 @@ from ..scene.observation import EYES, Observations, concatenate, count_heads
 from .imagefile import MAX_IMAGE_BYTES, array_of, image_of
 from .packed import INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
 
-IMAGE_SCHEMA, RENDERED_SCHEMA = "eyerender/image/4", "eyerender/image/3"
-"""Schemas of a line in a dataset, and in a rendered folder, whose lines have fewer keys."""
+IMAGE_SCHEMA = "eyerender/image/5"
+"""Schema of a line of metadata."""
 DATASET_SCHEMA, PACKED_SCHEMA = "eyerender/dataset/1", "eyerender/dataset/2"
 """Schemas of dataset.json where each picture is a file, and where shards are packed."""
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
@@ -70,7 +70,7 @@ KINDS = {
 # Keys of a line that name arrays of real numbers, with the number of channels of each (0: none).
 ARRAY_KEYS = {"depth_file_name": 0, "normals_file_name": 3, "iris_coordinates_file_name": 2}
 # Keys of a line that name files of the folder.
-FILE_KEYS = (*KINDS.values(), "lens_reflections_mask_file_name")
+FILE_KEYS = (*KINDS.values(), "lens_reflection_mask_file_name", "annotated_mask_file_name")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -411,10 +411,10 @@ class ImageFolder:
         lines = self.entries.lines
         if isinstance(lines, PackedLines):
             return np.asarray(lines.rows["sample"])
-        try:
-            return np.array([entry.line["sample"] for entry in self], dtype=np.int64)
-        except KeyError:
-            raise InputError("has images without a sample", source=str(self.path)) from None
+        found = [entry.line.get("sample") for entry in self]
+        if None in found:
+            raise InputError("has images without a sample", source=str(self.path))
+        return np.array(found, dtype=np.int64)
 
     def truth(self) -> Observations:
         """Read the records of the analytic observer for every image, in order.
@@ -539,9 +539,8 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
     def refuse(key: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=f"{where}.{key}")
 
-    if line.get("schema") not in (IMAGE_SCHEMA, RENDERED_SCHEMA):
-        found = shown(line.get("schema"))
-        refuse("schema", f"is {found}; this version reads {IMAGE_SCHEMA!r} and {RENDERED_SCHEMA!r}")
+    if line.get("schema") != IMAGE_SCHEMA:
+        refuse("schema", f"is {shown(line.get('schema'))}; this version reads {IMAGE_SCHEMA!r}")
     for key in FILE_KEYS:
         name = line.get(key)
         if not is_plain(name) and (name is not None or key == "file_name"):
@@ -563,11 +562,12 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
 
 def _check_names(line: dict[str, Any], refuse: Refuse) -> None:
     """Check the values that become parts of the names of exported files."""
-    for key in ("sample", "subject"):
-        if key in line and not _is_count(line[key], 2**63):
-            refuse(key, "must be a whole number >= 0")
-    if "split" in line and not (is_plain(line["split"]) and "/" not in line["split"] and len(line["split"]) <= 64):
-        refuse("split", f"must be a plain name, not {shown(line['split'])}")
+    for key in ("sample", "subject", "instant"):
+        if line.get(key) is not None and not _is_count(line[key], 2**63):
+            refuse(key, "must be null or a whole number >= 0")
+    split = line.get("split")
+    if split is not None and not (is_plain(split) and "/" not in split and len(split) <= 64):
+        refuse("split", f"must be null or a plain name, not {shown(split)}")
 
 
 def _check_records(records: Any, refuse: Refuse) -> None:
@@ -606,7 +606,7 @@ def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, 
     """Write metadata.jsonl and then dataset.json, which marks the folder complete."""
     with open(folder / METADATA, "w", encoding="utf-8") as file:
         for line in lines:
-            file.write(json.dumps({"schema": RENDERED_SCHEMA, **line}, allow_nan=False) + "\n")
+            file.write(json.dumps({"schema": IMAGE_SCHEMA, **line}, allow_nan=False) + "\n")
     dataset = {
         "schema": DATASET_SCHEMA,
         "digest": digest,

@@ -259,14 +259,14 @@ class _Task:
         """Return whether each row (or frame) is tested."""
         rows = ~np.isin(seen.index.fixation, [] if self.calibration is None else self.calibration)
         if self.binocular:
-            _, first = np.unique(seen.index.frame, return_index=True)
+            _, first = np.unique(seen.index.moment, return_index=True)
             rows = rows[first]
         return np.asarray(rows)
 
     def eyes(self, seen: Observations) -> Ints:
         """Return the eye of each row, or `_BOTH` for each frame."""
         if self.binocular:
-            return np.full(len(np.unique(seen.index.frame)), _BOTH)
+            return np.full(len(np.unique(seen.index.moment)), _BOTH)
         return np.asarray(seen.index.eye)
 
     def _predicted(self, fitted: GazeEstimator, seen: Observations) -> Floats:

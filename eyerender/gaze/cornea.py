@@ -53,7 +53,7 @@ def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radi
     Args:
         origin_mm: (..., 3) nodal points.
         glints: (..., m, 3) unit rays, m >= 2.
-        light_mm: (m, 3) lights.
+        light_mm: (..., m, 3) lights.
         radius_mm: (...) corneal radius.
     """
     m = glints.shape[-2]
@@ -124,12 +124,12 @@ def from_plane(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm
     Args:
         origin_mm: (..., 3) nodal points.
         glints: (..., m, 3) unit rays, m >= 2.
-        light_mm: (m, 3) lights.
+        light_mm: (..., m, 3) lights.
         radius_mm: (...) corneal radius.
     """
     b, ok = line_to_centre(origin_mm, glints, light_mm)
     radius = _radii(radius_mm, b.shape[:-1])
-    u, light = glints[..., 0, :], light_mm[:1]
+    u, light = glints[..., 0, :], light_mm[..., :1, :]
     e = unit(u - (u * b).sum(axis=-1, keepdims=True) * b)
     side = (u * e).sum(axis=-1)
     k = 80.0 * radius

@@ -15,7 +15,7 @@ from typing import Self
 
 import numpy as np
 
-from ..base.arrays import Floats
+from ..base.arrays import Floats, Ints
 from ..base.errors import InputError
 from ..base.spec import Spec
 from ..rig.rig import RigGeometry, RigLike
@@ -58,13 +58,13 @@ class CrossRatio(BuiltIn):
             InputError: no usable observation of an eye looks at one of the corner lights.
         """
         rig, targets = rig.build(), observations.index.target_mm
-        corners = self._corners_mm(rig)
-        glints, reason = glints_of(observations, (*self.corners, self.at_camera))
+        lights = self._lights(observations, rig)
+        glints, reason = glints_of(observations, lights)
         p, u_c = observations.pupil.centre_px, glints[:, 4]
-        near = self.tolerance * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
         found = {}
         for eye, name, usable in eyes_of(observations, is_none(reason)):
-            alpha = np.empty(4)
+            alpha, corners = np.empty(4), _corners_mm(rig, lights[observations.index.eye == eye][0])
+            near = self.tolerance * float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
             for i in range(4):
                 rows = usable[np.linalg.norm(targets[usable] - corners[i], axis=1) <= near]
                 if not len(rows):
@@ -77,21 +77,26 @@ class CrossRatio(BuiltIn):
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""
         rig = rig.build()
-        screen = screen_of(rig)
-        flat = screen.flat(self._corners_mm(rig))
-        glints, reason = glints_of(observations, (*self.corners, self.at_camera))
+        screen, lights = screen_of(rig), self._lights(observations, rig)
+        glints, reason = glints_of(observations, lights)
         on_screen = np.full((len(observations), 2), np.nan)
         for rows, alpha in calibrated_eyes(observations, self.alphas, reason):
             u_c = glints[rows, 4:5]
             virtual = u_c + alpha[:, None] * (glints[rows, :4] - u_c)
-            H, ok = homography(virtual, np.broadcast_to(flat, virtual.shape), conditioned=True)
+            flat = screen.flat(_corners_mm(rig, lights[rows]))
+            H, ok = homography(virtual, flat, conditioned=True)
             on_screen[rows], finite = transformed(H, observations.pupil.centre_px[rows])
             reason[rows[~finite]] = "the gaze point lies at infinity"
             reason[rows[~ok]] = "three of the glints lie on a line"
         return GazePoints.of(screen.world(on_screen), reason)
 
-    def _corners_mm(self, rig: RigGeometry) -> Floats:
+    def _lights(self, observations: Observations, rig: RigGeometry) -> Ints:
+        """Return the numbers (n, 5) of the corner lights and of the light at the camera."""
         if len(set(self.corners)) != 4 or self.at_camera in self.corners:
             raise InputError("the cross ratio needs four corner lights and one more light at the camera")
-        chosen_lights(rig, (*self.corners, self.at_camera), 5)
-        return np.array([rig.lights[k].position_mm for k in self.corners])
+        return chosen_lights(observations, rig, (*self.corners, self.at_camera), 5)
+
+
+def _corners_mm(rig: RigGeometry, lights: Ints) -> Floats:
+    """Return the positions (..., 4, 3) mm of the corner lights among the five lights (..., 5)."""
+    return np.array([light.position_mm for light in rig.lights])[lights[..., :4]]

@@ -110,10 +110,11 @@ class DirectionRegression(PolynomialEstimator):
         """Compute features (n, 2) px, and the reasons (n,) where there are none; None elsewhere."""
         built = rig.build()
         _, unknown = camera_of(observations, built)
-        lights = () if self.feature == "pupil" else chosen_lights(built, self.lights, 1)
+        with_glints = self.feature != "pupil"
+        lights = chosen_lights(observations, built, self.lights if with_glints else (), int(with_glints))
         places, reason = glints_of(observations, lights)
         reason = np.where(is_none(unknown), reason, unknown)
         found = observations.pupil.centre_px
-        if lights:
+        if with_glints:
             found = found - places.mean(axis=1)
         return np.where(is_none(reason)[:, None], found, np.nan), reason

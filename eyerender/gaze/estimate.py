@@ -139,9 +139,10 @@ class StoredEstimator(GazeEstimator, Protocol):
 
 
 def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Observations, GazePoints]:
-    """Average both eyes' gaze points of each frame; also return the row of each frame's first observation.
+    """Average both eyes' gaze points of each instant; also return the row of each instant's first observation.
 
-    A frame in which either eye is missing has no binocular estimate: the mean of one eye would be biased towards it.
+    The estimates of an eye that several cameras see are averaged first. An instant at which either eye is missing has
+    no binocular estimate: the mean of one eye would be biased towards it. Records without instants are joined by frame.
 
     >>> scene = er.load_scene("guestrin2006")
     >>> seen = er.trace(scene)
@@ -150,16 +151,18 @@ def binocular_average(observations: Observations, gaze: GazePoints) -> tuple[Obs
     >>> len(seen), len(both.point_mm)
     (90, 45)
     """
-    frames, first, which = np.unique(observations.index.frame, return_index=True, return_inverse=True)
-    reason = np.full(len(frames), None, dtype=object)
-    eyes = len(np.unique(observations.index.eye))
-    count = np.bincount(which, minlength=len(frames))
-    reason[count < eyes] = "one eye has no observation"
-    for row in np.flatnonzero(~gaze.ok)[::-1]:
+    moments, first, which = np.unique(observations.index.moment, return_index=True, return_inverse=True)
+    eyes, eye = np.unique(observations.index.eye, return_inverse=True)
+    reason = np.full(len(moments), None, dtype=object)
+    count, points = np.zeros((len(moments), len(eyes))), np.zeros((len(moments), len(eyes), 3))
+    np.add.at(count, (which, eye), gaze.ok)
+    np.add.at(points, (which, eye), np.where(gaze.ok[:, None], gaze.point_mm, 0.0))
+    reason[(count == 0).any(axis=1)] = "one eye has no observation"
+    for row in np.flatnonzero(~gaze.ok & (count[which, eye] == 0))[::-1]:
         reason[which[row]] = gaze.reason[row]
-    points = np.zeros((len(frames), 3))
-    np.add.at(points, which, gaze.point_mm)
-    return observations.take(first), GazePoints.of(points / count[:, None], reason)
+    with np.errstate(invalid="ignore"):
+        mean = (points / count[..., None]).mean(axis=1)
+    return observations.take(first), GazePoints.of(mean, reason)
 
 
 def ray_errors_deg(observations: Observations, rays: GazeRays) -> Floats:

@@ -169,7 +169,7 @@ class GuestrinEizenman(BuiltIn):
 
     def _centres(self, rays: FeatureRays, rows: Any, radius: Floats) -> CorneaCentres:
         find = from_plane if self.centre == "plane" else from_all_glints
-        return find(rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm, radius_mm=radius)
+        return find(rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm[rows], radius_mm=radius)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
         """Turn optic axes w (..., 3) to visual axes (..., 3): by alpha towards +y and by beta upwards, in radians."""

@@ -87,8 +87,7 @@ class Homography(BuiltIn):
 
     def normalised(self, observations: Observations, rig: RigGeometry) -> tuple[Floats, Objects]:
         """Compute the pupil centre in the unit square of the glints (n, 2), and why there is none (n,)."""
-        chosen_lights(rig, self.lights, 4)
-        glints, reason = glints_of(observations, self.lights)
+        glints, reason = glints_of(observations, chosen_lights(observations, rig, self.lights, 4))
         H, ok = homography(glints, np.broadcast_to(SQUARE, glints.shape))
         reason[is_none(reason) & ~ok] = "three of the glints lie on a line"
         s, finite = transformed(H, observations.pupil.centre_px)

@@ -152,21 +152,21 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
 def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
     """Compute centres of corneal curvature (n, 3) mm from the glints and an average radius; NaN where this fails."""
     centre = np.full((len(observations), 3), np.nan)
-    if len(rig.lights) < 2:
+    if min(len(rig.lights_of(eye)) for eye in np.unique(observations.index.eye).tolist()) < 2:
         return centre
     rays = feature_rays(observations, rig, None, least=2)
     rows = np.flatnonzero(is_none(rays.reason))
     if len(rows):
         radius = np.full(len(rows), MEAN_EYE.cornea_radius_mm)
         centre[rows] = from_all_glints(
-            rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm, radius_mm=radius
+            rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm[rows], radius_mm=radius
         ).centre_mm
     return centre
 
 
 def _middles(observations: Observations, place: Floats, frames: Observations) -> Floats:
     """Compute the vertex (f, 3) of each frame's binocular error: the head, or the point midway between the eyes."""
-    _, which = np.unique(observations.index.frame, return_inverse=True)
+    _, which = np.unique(observations.index.moment, return_inverse=True)
     total = np.zeros((len(frames), 3))
     np.add.at(total, which, place)
     middle = total / np.bincount(which, minlength=len(frames))[:, None]

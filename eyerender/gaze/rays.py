@@ -28,7 +28,7 @@ class FeatureRays(ArrayValue):
         origin_mm: (n, 3) nodal points.
         pupil: (n, 3) unit rays to the pupil centre.
         glints: (n, m, 3) unit rays to the glints.
-        light_mm: (m, 3) lights of the glints.
+        light_mm: (n, m, 3) lights of the glints.
         reason: (n,) why an observation has no rays, None where it has.
     """
 
@@ -47,15 +47,15 @@ def feature_rays(
     Args:
         observations: n observations.
         rig: the rig that observed them.
-        lights: lights of the glints; None: all of the rig's.
+        lights: lights of the glints, as for `chosen_lights`.
         least: smallest number of lights that is accepted.
 
     Raises:
         InputError: the rig has fewer than `least` lights, or not those that are named.
     """
-    wanted = chosen_lights(rig, lights, least)
+    wanted = chosen_lights(observations, rig, lights, least)
     camera, reason = camera_of(observations, rig)
-    n, m = len(observations), len(wanted)
+    n, m = wanted.shape
     places, missing = glints_of(observations, wanted)
     reason = np.where(camera < 0, reason, missing)
     origin, pupil, glints = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, m, 3), np.nan)
@@ -64,7 +64,7 @@ def feature_rays(
         origin[rows] = rig.cameras[k].nodal_point_mm
         pupil[rows] = rig.cameras[k].rays(observations.pupil.centre_px[rows])
         glints[rows] = rig.cameras[k].rays(places[rows])
-    light_mm = np.array([rig.lights[j].position_mm for j in wanted], dtype=float).reshape(m, 3)
+    light_mm = np.array([light.position_mm for light in rig.lights]).reshape(-1, 3)[wanted]
     return FeatureRays(
         origin_mm=frozen(origin),
         pupil=frozen(pupil),
@@ -74,29 +74,46 @@ def feature_rays(
     )
 
 
-def glints_of(observations: Observations, lights: tuple[int, ...]) -> tuple[Floats, Objects]:
-    """Return glints (n, m, 2) px of the lights in their order, and why an observation lacks pupil or glint (n,)."""
+def glints_of(observations: Observations, lights: Ints) -> tuple[Floats, Objects]:
+    """Return glints (n, m, 2) px of the lights (n, m), and why an observation lacks pupil or glint (n,)."""
     reason = np.full(len(observations), None, dtype=object)
     reason[~observations.pupil.ok] = "no pupil"
-    places = np.full((len(observations), len(lights), 2), np.nan)
-    for j, light in enumerate(lights):
+    places = np.full((*lights.shape, 2), np.nan)
+    for j, light in enumerate(lights.T):
         places[:, j], found = observations.glints.of_light(light)
-        reason[is_none(reason) & ~found] = f"no glint of light {light}"
+        for row in np.flatnonzero(is_none(reason) & ~found):
+            reason[row] = f"no glint of light {light[row]}"
     return places, reason
 
 
-def chosen_lights(rig: RigGeometry, lights: Sequence[int] | None, least: int) -> tuple[int, ...]:
-    """Return the lights to use: at least `least` different lights of the rig.
+def chosen_lights(observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, least: int) -> Ints:
+    """Return the rig's numbers (n, m) of the lights to use for each observation.
+
+    Args:
+        observations: n observations.
+        rig: the rig that observed them.
+        lights: the lights, counted from 0 among those that light the observation's eye; None: all of them, or as many
+            as the eye with the fewest has.
+        least: smallest number of lights that is accepted.
 
     Raises:
-        InputError: there are too few, or they are not different lights of the rig.
+        InputError: there are too few, or a light is named twice.
     """
-    wanted = tuple(range(len(rig.lights))) if lights is None else tuple(lights)
-    if len(set(wanted)) != len(wanted) or any(not 0 <= k < len(rig.lights) for k in wanted):
-        raise InputError(f"lights {list(wanted)} are not distinct lights of the rig, which has {len(rig.lights)}")
+    of_eye = {eye: rig.lights_of(eye) for eye in np.unique(observations.index.eye).tolist()}
+    fewest = min(map(len, of_eye.values()), default=len(rig.lights))
+    wanted = tuple(range(fewest)) if lights is None else tuple(lights)
+    if len(set(wanted)) != len(wanted) or any(k < 0 for k in wanted):
+        raise InputError(f"lights {list(wanted)} are not distinct lights")
+    each = " for each eye" if any(light.eyes is not None for light in rig.lights) else ""
     if len(wanted) < least:
-        raise InputError(f"this estimator needs {least} lights, but the rig has {len(wanted)}")
-    return wanted
+        raise InputError(f"this estimator needs {least} lights, but the rig has {fewest}{each}")
+    if any(k >= fewest for k in wanted):
+        named = ", ".join(map(str, wanted))
+        raise InputError(f"this estimator needs {len(wanted)} lights ({named}), but the rig has {fewest}{each}")
+    out = np.empty((len(observations), len(wanted)), dtype=np.int64)
+    for eye, numbers in of_eye.items():
+        out[observations.index.eye == eye] = [numbers[k] for k in wanted]
+    return out
 
 
 def camera_of(observations: Observations, rig: RigGeometry) -> tuple[Ints, Objects]:

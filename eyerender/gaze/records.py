@@ -15,7 +15,7 @@ from ..base.arrays import frozen
 from ..base.errors import InputError, Problems
 from ..base.spec import FileSpec, Positive, Spec, Vec3, read_yaml
 from ..base.storage.files import parse_json, read_text
-from ..rig.camera import CameraCalibration, PinholeCamera
+from ..rig.camera import CameraCalibration, EyeNames, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
 from ..rig.rig import MAX_CAMERAS, Rig, RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
@@ -125,11 +125,13 @@ class _CameraData(CameraCalibration):
 
     t_mm: Vec3 = Field(alias="t")
     resolution_px: tuple[_Pixels, _Pixels]
-    mirrored: bool = False
+    mirrored: bool | None = None
+    flip: None = None
+    eyes: EyeNames | None = None
 
     def build(self) -> PinholeCamera:
         camera = PinholeCamera.of(self.K, self.R, self.t_mm, self.resolution_px, self.distortion)
-        return replace(camera, mirrored=self.mirrored)
+        return replace(camera, mirrored=bool(self.mirrored), eyes=self.eyes)
 
 
 class _ScreenData(Spec):
@@ -160,13 +162,27 @@ class _RigData(Spec):
 
     cameras: Annotated[tuple[_CameraData, ...], Field(max_length=MAX_CAMERAS)]
     lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=MAX_LIGHTS)] | None = None
+    light_eyes: Annotated[tuple[EyeNames | None, ...], Field(max_length=MAX_LIGHTS)] | None = None
     screen: _ScreenData | None = None
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.light_eyes is not None and len(self.light_eyes) != len(self.lights_mm or ()):
+            raise ValueError("light_eyes: must have an entry for each of lights_mm")
+        return self
+
     def build(self) -> RigGeometry:
-        axis = frozen([1.0, 0.0, 0.0])
+        plain = Lamp(
+            position_mm=frozen([0.0, 0.0, 0.0]),
+            axis=frozen([1.0, 0.0, 0.0]),
+            radius_mm=0.0,
+            intensity_mw_sr=1.0,
+            lobe_exponent=0.0,
+        )
+        places = self.lights_mm or ()
+        of_eyes = self.light_eyes or (None,) * len(places)
         lights = [
-            Lamp(position_mm=frozen(place), axis=axis, radius_mm=0.0, intensity_mw_sr=1.0, lobe_exponent=0.0)
-            for place in self.lights_mm or ()
+            replace(plain, position_mm=frozen(place), eyes=eyes) for place, eyes in zip(places, of_eyes, strict=True)
         ]
         screen = None if self.screen is None else self.screen.build()
         return RigGeometry(tuple(camera.build() for camera in self.cameras), tuple(lights), screen)

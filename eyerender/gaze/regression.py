@@ -19,12 +19,21 @@ from pydantic import Field
 from ..base.arrays import Floats, Ints, Objects
 from ..base.errors import InputError
 from ..base.spec import Spec
-from ..rig.rig import RigLike
+from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
 from .builtin import BuiltIn, EstimatorOptions
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
-from .rays import calibrated_eyes, eye_name, eyes_of, glints_of, is_none, screen_of, targets_on_screen
+from .rays import (
+    calibrated_eyes,
+    chosen_lights,
+    eye_name,
+    eyes_of,
+    glints_of,
+    is_none,
+    screen_of,
+    targets_on_screen,
+)
 
 
 def _terms(text: str) -> Terms:
@@ -175,7 +184,7 @@ class Regression(PolynomialEstimator):
             InputError: there are too few usable targets, or they do not determine the polynomial.
         """
         wanted = targets_on_screen(observations, screen_of(rig.build()))
-        v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
+        v, reason = pupil_glint_vectors(observations, self.light, self.normalised, rig.build())
         if self.normalised and (_partners(observations.index.frame, observations.index.eye) < 0).all():
             raise InputError(
                 "no frame has both a right and a left eye, whose distance is the unit of the pupil-glint vector; "
@@ -212,7 +221,7 @@ class Regression(PolynomialEstimator):
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:
         """Estimate gaze points on the screen's plane."""
         screen = screen_of(rig.build())
-        v, reason = pupil_glint_vectors(observations, self.light, self.normalised)
+        v, reason = pupil_glint_vectors(observations, self.light, self.normalised, rig.build())
         return GazePoints.of(screen.world(self.mapped(v, observations, reason)), reason)
 
     def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
@@ -235,14 +244,17 @@ def _instead(vectors: Floats) -> str:
     return f"; {better} is the function with the most terms that they determine" if better else ""
 
 
-def pupil_glint_vectors(observations: Observations, light: int = 0, normalised: bool = True) -> tuple[Floats, Objects]:
+def pupil_glint_vectors(
+    observations: Observations, light: int = 0, normalised: bool = True, rig: RigGeometry | None = None
+) -> tuple[Floats, Objects]:
     """Compute pupil-glint vectors (n, 2), and the reasons (n,) where there are none; None elsewhere.
 
-    Normalised vectors need both eyes of a frame: the distance of their pupils is the unit. Otherwise the unit is
-    pixels.
+    Normalised vectors need both eyes in a frame: the distance of their pupils is the unit. Otherwise the unit is
+    pixels. With a rig, `light` counts the lights that light the eye; otherwise it is the number in the records.
     """
     index, pupil = observations.index, observations.pupil
-    glints, reason = glints_of(observations, (light,))
+    same = np.full((len(observations), 1), light)
+    glints, reason = glints_of(observations, same if rig is None else chosen_lights(observations, rig, (light,), 1))
     vectors = pupil.centre_px - glints[:, 0]
     if normalised:
         partner = _partners(index.frame, index.eye)

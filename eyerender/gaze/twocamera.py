@@ -31,7 +31,8 @@ _PARALLEL = 1e-7
 class ShihWuLiu(Recalibrated):
     """Optic axis from two cameras, corrected by a polynomial.
 
-    Observations of the two cameras are paired by head position, fixation and eye; both get the same estimate.
+    Observations of the two cameras are paired by instant and eye (if instants are unknown, by head position, fixation
+    and eye); both get the same estimate.
 
     >>> er.gaze.ShihWuLiu(cameras=(0, 1)).cameras
     (0, 1)
@@ -74,7 +75,7 @@ class ShihWuLiu(Recalibrated):
         first, second = self._pairs(observations)
         n = len(observations)
         centre, axis = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-        reason = np.full(n, "the other camera has no observation of this fixation", dtype=object)
+        reason = np.full(n, "the other camera has no observation of this moment", dtype=object)
         c, c_ok = _closest(rays.origin_mm[first], b1=lines[first], o2=rays.origin_mm[second], b2=lines[second])
         d, d_ok = _normal_to_both(rays, first, second, c)
         for rows in (first, second):
@@ -87,10 +88,13 @@ class ShihWuLiu(Recalibrated):
         return GazeRays.of(centre, axis, reason)
 
     def _pairs(self, observations: Observations) -> tuple[Ints, Ints]:
-        """Return the rows of the first and of the second camera that show the same fixation of the same eye."""
+        """Return the rows of the first and of the second camera that show the same eye at the same moment."""
         index = observations.index
-        key = np.stack([index.head, index.fixation, index.eye], axis=1)
-        known = index.fixation >= 0
+        timed = index.instant >= 0
+        key = np.stack(
+            [np.where(timed, index.instant, index.fixation), np.where(timed, -1, index.head), index.eye], axis=1
+        )
+        known = timed | (index.fixation >= 0)
         where = {
             camera: {tuple(key[r]): int(r) for r in np.flatnonzero(known & (index.camera == camera))}
             for camera in self.cameras

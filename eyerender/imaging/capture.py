@@ -206,7 +206,7 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         t=t,
         camera=scene.rig.cameras[camera],
         window=scene.window(camera, head, int(index.eye[row])),
-        lights=scene.rig.lights,
+        lights=tuple(scene.rig.lights[k] for k in scene.rig.lights_of(int(index.eye[row]))),
         sensor=scene.spec.sensor,
         look=scene.spec.look,
         region=None if scene.region is None else scene.region.of_side(EYES[index.eye[row]]),

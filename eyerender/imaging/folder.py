@@ -16,7 +16,8 @@ from ..rig.plausibility import is_saturated, saturation_warnings
 from ..scene import Scene
 from ..scene.observation import EYES
 from .capture import check_windows, render_job, render_windows
-from .labels import seen_labels
+from .labels import image_labels
+from .lines import image_line
 
 
 def render_folder(
@@ -60,24 +61,8 @@ def render_folder(
         (folder / "images").mkdir()
         (folder / "masks").mkdir()
         for image in render_windows(frames, backend=backend, threads=threads, progress=progress):
-            line: dict[str, Any] = {
-                "file_name": f"images/{image.name}.png",
-                "mask_file_name": f"masks/{image.name}.png",
-                "window_px": dict(zip(("x0", "y0", "width", "height"), image.window, strict=True)),
-                "bit_depth": spec.sensor.bit_depth,
-                "gamma": spec.sensor.gamma,
-                "records": [records[image.row]],
-                "labels": seen_labels(image, truth),
-                "parameters": {
-                    "eye_model": scene.eye_name,
-                    "pupil_diameter_mm": scene.stop_diameter_mm(records[image.row]["eye"]),
-                    "wavelength_nm": spec.wavelength_nm,
-                    "spp": spec.image.spp,
-                    "seed": spec.seed,
-                    "camera": image.camera,
-                    **scene.person_numbers(records[image.row]["eye"]),
-                },
-            }
+            line = image_line(scene, records[image.row], image.window, image_labels(image, truth))
+            line |= {"file_name": f"images/{image.name}.png", "mask_file_name": f"masks/{image.name}.png"}
             writer.put(folder / line["file_name"], image.counts)
             writer.put(folder / line["mask_file_name"], image.parts)
             if exr:

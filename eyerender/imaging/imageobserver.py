@@ -30,7 +30,7 @@ from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry, RigLike
 from ..scene import Frames, Scene
-from ..scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from ..scene.spec import SceneSpec
 from .capture import EyeImage, render_windows
 
@@ -175,20 +175,26 @@ class ImageObserver:
     def observe_found(
         self, found: Sequence[Extraction], frame: int, shape: tuple[int, int], *, scene: Scene | None, source: str
     ) -> Observations:
-        """Convert extractions of a whole sensor image (h, w) to observations: of one eye, or of both halves."""
+        """Convert extractions of a whole sensor image (h, w) to observations: of one eye, or of both halves.
+
+        A single eye has a name if the scene's camera sees only one of the scene's eyes.
+        """
         parts = []
         for side, one in enumerate(found):
             lights: Sequence[int] = [-1] * len(one.glints)
             reasons: Sequence[str | None] = [None] * len(one.glints)
+            eye = side if len(found) > 1 else -1
             if scene is not None:
                 # The part of the sensor that a single image shows is unknown, so only a whole sensor image can be
                 # placed.
                 camera = scene.rig.cameras[0]
                 if shape != (camera.resolution_px[1], camera.resolution_px[0]):
                     raise InputError(f"is {shape[1]} x {shape[0]} px, but the scene's sensor is not", source=source)
-                lights, reasons = _lights(one, np.zeros(2), scene.rig, camera, np.full(3, np.nan))
-            eye = np.array([side if len(found) > 1 else -1])
-            parts.append(_observation(one, lights, reasons, np.zeros(2), Index(frame=np.array([frame]), eye=eye)))
+                sides = [EYES.index(name) for name in scene.spec.subject.eyes if camera.sees(name)]
+                eye = sides[0] if len(found) == len(sides) == 1 else eye
+                lights, reasons = _lights(one, np.zeros(2), scene.rig, camera, np.full(3, np.nan), eye)
+            index = Index(frame=np.array([frame]), eye=np.array([eye]))
+            parts.append(_observation(one, lights, reasons, np.zeros(2), index))
         return concatenate(parts)
 
     def _observe_rows(
@@ -215,7 +221,7 @@ class ImageObserver:
                 update={"radius_min_px": max(0.6 * px_per_mm, 3.0), "radius_max_px": max(5.0 * px_per_mm, 8.0)}
             )
             found = extract(cut, bit_depth=depth, gamma=gamma if gamma != 1 else self.gamma, settings=settings)
-            lights, reasons = _lights(found, corner, rig, camera, eye_mm)
+            lights, reasons = _lights(found, corner, rig, camera, eye_mm, int(index.eye[row]))
             parts.append(_observation(found, lights, reasons, corner, index.take([row])))
         return concatenate(parts)
 
@@ -354,14 +360,17 @@ def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: flo
 
 
 def _lights(
-    found: Extraction, corner: Floats, rig: RigGeometry, camera: PinholeCamera, eye_mm: Floats
+    found: Extraction, corner: Floats, rig: RigGeometry, camera: PinholeCamera, eye_mm: Floats, eye: int
 ) -> tuple[list[int], Sequence[str | None]]:
-    """Assign glints to lights (-1: none, with the reason), from the rig and an approximate position of the eye."""
+    """Assign glints to lights that light the eye (-1: none, with the reason), from the rig and the eye's position."""
     if not found.glints or found.pupil.ellipse is None:
         return [-1] * len(found.glints), ["no pupil to place the reflections by"] * len(found.glints)
     spots = np.array([g.xy_px for g in found.glints]) + corner
     pupil = np.asarray(found.pupil.ellipse.centre_px) + corner
-    places = np.array([light.position_mm for light in rig.lights])
+    numbers = rig.lights_of(eye)
+    if not numbers:
+        return [-1] * len(found.glints), ["no light of the rig lights this eye"] * len(found.glints)
+    places = np.array([rig.lights[k].position_mm for k in numbers]).reshape(-1, 3)
     predicted, px_per_mm = predict_glints(
         camera.ideal(pupil),
         K=camera.K,
@@ -371,7 +380,7 @@ def _lights(
         eye_mm=eye_mm,
     )
     assigned = assign_lights(camera.ideal(spots), predicted, shift_sd_px=_PLACE_MM * px_per_mm)
-    return [int(k) for k in assigned.light], assigned.reasons
+    return [numbers[k] if k >= 0 else -1 for k in assigned.light], assigned.reasons
 
 
 def _observation(

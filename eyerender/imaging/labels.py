@@ -29,6 +29,7 @@ from ..scene.parts import IRIS, PUPIL
 from .capture import EyeImage, eye_motion
 from .renderable import RenderableFrames, RenderableScene
 
+RIM_HIDDEN = "the cornea hides a part of its rim"
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
 _FAR_MM = 1e9  # a distant observer: the entrance pupil looks larger than from infinity by 3e-9 of its size
@@ -58,53 +59,39 @@ class EyeInWindow:
         return cls(row=row, camera=camera, window=scene.window(camera, head, side), eye=scene.eye(EYES[side]), M=M, t=t)
 
 
-def seen_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """Measure pupil, iris, glints and lids in the image: the labels of a rendered folder.
+def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
+    """Compute all labels of an image, with the same keys for every image.
 
     Args:
         image: a rendered image, row `image.row` of `truth`.
         truth: observations of the rendered frames by the analytic observer.
     """
-    done, row = image.rendered, image.row
+    done, part, window = image.rendered, image.parts, image.window
     assert done.labels is not None
-    points = truth.pupil.points_px[row]
-    whole = bool(truth.pupil.ok[row]) and len(points) > 2
-    return {
-        "pupil_visible_fraction": finite_or_none(done.labels.visible_fraction(PUPIL)),
-        "iris_visible_fraction": finite_or_none(done.labels.visible_fraction(IRIS)),
-        "failed_paths": done.failed_paths,
-        "pupil_visible_arcs_deg": visible_arcs_deg(image.parts, PUPIL, points, image.window[:2]) if whole else None,
-        "glints": [
-            {"light": i, "reason": reason, "visible_share": float(share)}
-            for i, (reason, share) in enumerate(zip(done.glint_reasons, done.glints.share, strict=True))
-        ],
-        "lid_margins_px": done.lid_margins_px,
-    }
-
-
-def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
-    """Compute all labels of an image, with the same keys for every image; the arguments are those of `seen_labels`."""
-    part, window, seen = image.parts, image.window, seen_labels(image, truth)
     known = known_labels(image.scene, truth, image)
+    points = truth.pupil.points_px[image.row]
+    whole = bool(truth.pupil.ok[image.row]) and len(points) > 2
     return {
+        "eye_present": True,
         "pupil": {
             **known["pupil"],
             "visible": moments_ellipse(part == PUPIL, window),
-            "visible_fraction": seen["pupil_visible_fraction"],
-            "visible_arcs_deg": seen["pupil_visible_arcs_deg"],
+            "visible_fraction": finite_or_none(done.labels.visible_fraction(PUPIL)),
+            "visible_arcs_deg": visible_arcs_deg(part, PUPIL, points, window[:2]) if whole else None,
         },
         "iris": {
             **known["iris"],
             "visible": moments_ellipse((part == PUPIL) | (part == IRIS), window),
-            "visible_fraction": seen["iris_visible_fraction"],
+            "visible_fraction": finite_or_none(done.labels.visible_fraction(IRIS)),
         },
         "glints": [
-            glint | _seen_glint(image, k, seen["glints"][k]["reason"]) for k, glint in enumerate(known["glints"])
+            glint | _seen_glint(image, k, reason)
+            for k, (glint, reason) in enumerate(zip(known["glints"], done.glint_reasons, strict=True))
         ],
-        "lid_margins_px": seen["lid_margins_px"],
+        "lid_margins_px": done.lid_margins_px,
         "lid_opening": None,
         **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
-        "failed_paths": int(seen["failed_paths"]),
+        "failed_paths": int(done.failed_paths),
     }
 
 
@@ -196,17 +183,19 @@ def iris_outline(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[s
     """Compute the ellipse of the apparent limbus (`limbus_px`), with a status, and a reason if there is none."""
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
+    hidden = {"rim_hidden": reason == RIM_HIDDEN}
     if reason is not None:
-        return {"status": "missing", "reason": reason, **nothing}
+        return {"status": "missing", "reason": reason, **nothing, **hidden}
     fit = fit_ellipse_direct(pixels)
     if not fit.ok:
-        return {"status": "missing", "reason": "no ellipse fits the outline", **nothing}
+        return {"status": "missing", "reason": "no ellipse fits the outline", **nothing, **hidden}
     return {
         "status": "ok",
         "reason": None,
         "centre_px": fit.centre_px.tolist(),
         "semi_axes_px": fit.semi_axes_px.tolist(),
         "angle_rad": float(fit.angle_rad),
+        **hidden,
     }
 
 
@@ -232,7 +221,7 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     if not front.all():
         reason = "behind the camera"
     elif not facing.all():
-        reason = "the cornea hides a part of its rim"
+        reason = RIM_HIDDEN
     return np.asarray(pixels), reason
 
 
@@ -270,10 +259,10 @@ def _ellipse_of_record(observations: Observations, row: int) -> dict[str, Any]:
 
 
 def _glints(scene: RenderableScene, observations: Observations, view: EyeInWindow | EyeImage) -> list[dict[str, Any]]:
-    """Compute the position of each lamp's glint centre by ray optics."""
+    """Compute the position of the glint's centre by ray optics for each lamp that lights the eye."""
     glints, row = observations.glints, view.row
     out = []
-    for k in range(len(scene.rig.lights)):
+    for k in scene.rig.lights_of(int(observations.index.eye[row])):
         xy, _ = glints.of_light(k)
         found = bool(np.isfinite(xy[row]).all())
         at = (glints.light[row] == k) & (glints.status[row] != Status.NONE)
@@ -291,7 +280,7 @@ def _glints(scene: RenderableScene, observations: Observations, view: EyeInWindo
 
 
 def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any]:
-    """Measure the visible part of a lamp's glint, which may exist even if the lamp's centre has no mirror point."""
+    """Measure the visible part of the k-th glint, which may exist even if the lamp's centre has no mirror point."""
     table = image.rendered.glints
     spot = table.xy_px[k]
     lit = bool(np.isfinite(spot).all())
@@ -338,6 +327,19 @@ def _space(
         "camera": {k: v.tolist() for k, v in seen.items()}
         | {"target_mm": (axes @ target + offset).tolist() if there else None},
     }
+
+
+def space_labels(frames: RenderableFrames, observations: Observations) -> list[dict[str, Any]]:
+    """Compute points and lines in space and the diameters of the pupils for each observation of frames."""
+    scene, out = frames.scene, []
+    for row in range(len(observations)):
+        view = EyeInWindow.of(frames, row)
+        diameters = {
+            "entrance_diameter_mm": entrance_diameter_mm(view.eye),
+            "stop_diameter_mm": scene.stop_diameter_mm(EYES[int(observations.index.eye[row])]),
+        }
+        out.append(_space(scene, observations, view, scene.rig.cameras[view.camera]) | diameters)
+    return out
 
 
 def _line_of_sight(

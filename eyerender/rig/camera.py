@@ -16,11 +16,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.errors import InputError
@@ -32,6 +32,17 @@ Distortion = tuple[Number, Number, Number, Number, Number]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
 Window = tuple[int, int, int, int]
 """A part of a sensor: its first column and row, its width and its height (px)."""
+Side = Literal["right", "left"]
+SIDES: tuple[Side, Side] = ("right", "left")
+
+
+def _distinct(eyes: tuple[Side, ...]) -> tuple[Side, ...]:
+    if len(set(eyes)) != len(eyes):
+        raise ValueError("name each eye only once")
+    return eyes
+
+
+EyeNames = Annotated[tuple[Side, ...], Field(min_length=1, max_length=2), AfterValidator(_distinct)]
 
 _PLACE = {"position_mm", "look_at_mm", "pan_deg", "tilt_deg"}
 _LENS = {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"}
@@ -135,6 +146,9 @@ class Camera(Spec):
         description="plane mirror (a hot mirror) through which it sees the eyes; place, direction and calibration are "
         "those of the camera itself",
     )
+    eyes: EyeNames | None = Field(
+        default=None, description="eyes that it sees; it has no frames of the other eye; default: both"
+    )
 
     @classmethod
     def from_opencv(
@@ -182,8 +196,8 @@ class Camera(Spec):
         else:
             R, t = found.R, found.t * self.calibration.unit_mm
         numbers = {"K": found.K, "R": R, "t_mm": t, "distortion": found.distortion}
-        kept = {"name": self.name, "resolution_px": self.resolution_px, "calibration": numbers, "mirror": self.mirror}
-        return type(self).from_mapping(kept, source=str(path))
+        kept = {"name": self.name, "resolution_px": self.resolution_px, "mirror": self.mirror, "eyes": self.eyes}
+        return type(self).from_mapping({**kept, "calibration": numbers}, source=str(path))
 
     @classmethod
     def looking_at(
@@ -246,7 +260,7 @@ class Camera(Spec):
         Raises:
             InputError: the camera lies in the plane of its mirror, or its calibration file cannot be read.
         """
-        camera = self.unmirrored()
+        camera = replace(self.unmirrored(), eyes=self.eyes)
         return camera if self.mirror is None else camera.seen_in(self.mirror)
 
     def unmirrored(self) -> PinholeCamera:
@@ -289,6 +303,7 @@ class PinholeCamera(ArrayValue):
         resolution_px: (w, h).
         name: name of the camera.
         mirrored: whether it is the virtual camera behind a plane mirror: u is flipped about the principal point.
+        eyes: eyes that it sees; None: both.
     """
 
     K: Floats
@@ -298,6 +313,7 @@ class PinholeCamera(ArrayValue):
     resolution_px: tuple[int, int]
     name: str
     mirrored: bool = False
+    eyes: tuple[Side, ...] | None = None
 
     @classmethod
     def of(
@@ -329,6 +345,10 @@ class PinholeCamera(ArrayValue):
         return replace(
             self, R=frozen(flip[:, None] * (self.R @ reflect)), t=frozen(flip * t), mirrored=not self.mirrored
         )
+
+    def sees(self, side: str) -> bool:
+        """Return whether the camera sees an eye, right or left."""
+        return self.eyes is None or side in self.eyes
 
     @property
     def across(self) -> float:
@@ -414,6 +434,12 @@ def in_window(window: Window, pixels: ArrayLike) -> Bools:
     p = np.asarray(pixels, dtype=float)
     x, y, (x0, y0, w, h) = p[..., 0], p[..., 1], window
     return np.asarray((x >= x0 - 0.5) & (x <= x0 + w - 0.5) & (y >= y0 - 0.5) & (y <= y0 + h - 0.5))
+
+
+def beyond_window(window: Window, pixels: Floats) -> float:
+    """Return how far (px) the farthest of pixels (n, 2) lies outside a window along an axis; 0 if none does."""
+    low = np.array(window[:2]) - 0.5
+    return float(np.maximum(low - pixels, pixels - (low + window[2:])).max(initial=0.0))
 
 
 def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:

@@ -14,7 +14,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.spec import NonNegative, Number, Positive, Spec, Vec3
-from .camera import PinholeCamera
+from .camera import SIDES, EyeNames, PinholeCamera, Side
 
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
 # frame.
@@ -70,7 +70,11 @@ class Led(Spec):
     )
     intensity_mw_sr: Positive = Field(default=20.0, description="radiant intensity on the axis")
     lobe_exponent: NonNegative = Field(default=1.0, description="m of cos^m; 1 is Lambertian, 0 isotropic")
-
+    eyes: EyeNames | None = Field(
+        default=None,
+        description="eyes that it lights, all LEDs of a ring alike; the nose or a seal keeps its light "
+        "from the other eye; default: both",
+    )
     duty_cycle: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None,
         description="share of the time in which it is on, for eye safety alone; pictures expose while it is on; "
@@ -118,6 +122,7 @@ class Led(Spec):
                 lobe_exponent=self.lobe_exponent,
                 inner_radius_mm=self.inner_radius_mm,
                 duty_cycle=1.0 if self.duty_cycle is None else self.duty_cycle,
+                eyes=self.eyes,
             )
             for p, aim in ((place, self._aim(place)) for place in places)
         )
@@ -135,6 +140,7 @@ class Lamp(ArrayValue):
         lobe_exponent: m of cos^m.
         inner_radius_mm: radius of the hole of a ring-shaped emitter.
         duty_cycle: share of the time in which it is on; used for eye safety only.
+        eyes: eyes that it lights; None: both. Eye safety counts its light for both eyes all the same.
     """
 
     position_mm: Floats
@@ -144,6 +150,11 @@ class Lamp(ArrayValue):
     lobe_exponent: float
     inner_radius_mm: float = 0.0
     duty_cycle: float = 1.0
+    eyes: tuple[Side, ...] | None = None
+
+    def lights(self, eye: int) -> bool:
+        """Return whether the LED lights an eye: 0 right, 1 left, -1 unknown (then yes)."""
+        return self.eyes is None or eye < 0 or SIDES[eye] in self.eyes
 
     def towards(self, point_mm: Floats) -> tuple[float, float, float]:
         """Compute the radiant intensity I cos^m (mW/sr) towards a point (3,), this cosine, and the distance (mm)."""

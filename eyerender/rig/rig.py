@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from ..base.arrays import ArrayValue
+from ..base.arrays import ArrayValue, Bools, Ints
 from ..base.errors import InputError
 from ..base.spec import Spec
-from .camera import Camera, PinholeCamera
+from .camera import Camera, PinholeCamera, Side
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import Mount
 from .screen import Screen, ScreenPlane
@@ -34,7 +34,7 @@ class Rig(Spec):
         description="the cameras; each takes frames of its own"
     )
     lights: Annotated[tuple[Led, ...], Field(min_length=1, max_length=MAX_LIGHTS)] = Field(
-        description="the infrared LEDs; all of them are on in every frame"
+        description="the infrared LEDs; all of them are on in every frame, and light the eyes that they name"
     )
     screen: Screen | None = Field(default=None, description="the screen that holds the targets")
     mount: Mount | None = Field(
@@ -108,6 +108,23 @@ class Rig(Spec):
         cameras = [*self.cameras[:number], *self.cameras[number + 1 :]]
         return self._with_leds(self._single_leds(0), cameras=cameras)
 
+    def of_eye(self, side: Side) -> Self:
+        """Return the rig that one eye meets: cameras that see it and LEDs that light it; rings become single LEDs.
+
+        Without `eyes` in any camera or LED, this is the rig itself.
+
+        Raises:
+            InputError: no camera sees the eye, or no LED lights it.
+        """
+        if not any([camera.eyes for camera in self.cameras] + [led.eyes for led in self.lights]):
+            return self
+        cameras = [camera for camera in self.cameras if camera.eyes is None or side in camera.eyes]
+        leds = [led for led in self._single_leds(0) if side in (led.get("eyes") or (side,))]
+        for name, kept, verb in (("cameras", cameras, "sees"), ("lights", leds, "lights")):
+            if not kept:
+                raise InputError(f"none {verb} the {side} eye", path=f"rig.{name}")
+        return self._with_leds(leds, cameras=cameras)
+
     def _single_leds(self, number: int) -> list[dict[str, Any]]:
         """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
@@ -171,6 +188,15 @@ class RigGeometry(ArrayValue):
         """Return this rig, which is already numeric."""
         return self
 
+    def lights_of(self, eye: int) -> tuple[int, ...]:
+        """Return the numbers of the lights that light an eye: 0 right, 1 left, -1 unknown (then all)."""
+        return tuple(k for k, light in enumerate(self.lights) if light.lights(eye))
+
+    def lit(self, eye: Ints) -> Bools:
+        """Return whether each light lights each eye: (n, lights) for eyes (n,), 0 right, 1 left, -1 unknown."""
+        by_eye = np.array([[light.lights(side) for light in self.lights] for side in (0, 1, -1)], dtype=bool)
+        return np.asarray(by_eye[eye])
+
     def to_mapping(self) -> dict[str, Any]:
         """Convert to the mapping that `features --json` writes (see docs/formats.md)."""
         screen = self.screen
@@ -182,11 +208,14 @@ class RigGeometry(ArrayValue):
                     "t": c.t.tolist(),
                     "distortion": c.distortion.tolist(),
                     "resolution_px": list(c.resolution_px),
-                    **({"mirrored": True} if c.mirrored else {}),
+                    "mirrored": c.mirrored or None,
+                    "flip": None,
+                    "eyes": _listed(c.eyes),
                 }
                 for c in self.cameras
             ],
             "lights_mm": [light.position_mm.tolist() for light in self.lights],
+            "light_eyes": [_listed(light.eyes) for light in self.lights],
             "screen": None
             if screen is None
             else {
@@ -196,3 +225,7 @@ class RigGeometry(ArrayValue):
                 "up": screen.up.tolist(),
             },
         }
+
+
+def _listed(eyes: tuple[Side, ...] | None) -> list[Side] | None:
+    return None if eyes is None else list(eyes)

@@ -20,7 +20,7 @@ from ..base.errors import InputError, Problems
 from ..base.status import Status
 from ..base.storage.files import shown
 
-RECORD_SCHEMA = "eyerender/record/2"
+RECORD_SCHEMA = "eyerender/record/3"
 """Schema of a record."""
 EYES = ("right", "left")
 
@@ -28,6 +28,9 @@ EYES = ("right", "left")
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
 # Largest number of glints of all observations of a batch; each has a status and a reason.
 MAX_GLINTS = 5_000_000
+# Keys of a record that no scene fills yet: motion of rig and eye, reflections beside the glints.
+_UNUSED = ("rig_pose", "events", "blink_phase")
+_UNUSED_FEATURES = ("lens_glints", "ghost_glints", "purkinje")
 # Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
@@ -38,6 +41,8 @@ class Index(Columns):
 
     Attributes:
         frame: number of the frame.
+        instant: number that the frames of all cameras at one moment share; -1 is unknown.
+        subject: number of the person; -1 is unknown.
         fixation: index of the fixation. Fixations, cameras and heads are counted from 0 in the scene's order; -1 is
             unknown.
         camera: index of the camera.
@@ -47,9 +52,12 @@ class Index(Columns):
         target_mm: (n, 3) NaN where there is no target.
         head_mm: (n, 3) head position.
         eye_position_mm: (n, 3) apex of the unrotated eye in the world, without `head_mm`.
+        time_s: time of mid-exposure.
     """
 
     frame: Ints
+    instant: Ints = column()
+    subject: Ints = column()
     fixation: Ints = column()
     camera: Ints = column()
     head: Ints = column()
@@ -58,9 +66,15 @@ class Index(Columns):
     target_mm: Floats = column(3)
     head_mm: Floats = column(3)
     eye_position_mm: Floats = column(3)
+    time_s: Floats = column()
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def moment(self) -> Ints:
+        """Number (n,) by which rows of one moment are joined: the instant, or the frame if instants are unknown."""
+        return self.instant if (self.instant >= 0).all() else self.frame
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -117,8 +131,8 @@ class PupilFeatures(Columns):
 class GlintFeatures(Columns):
     """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is unknown.
 
-    `status` (n, m) are `Status`, with a `reason` in words where it is not OK. Rows with fewer than m glints are padded
-    with status NONE.
+    `status` (n, m) are `Status`, with a `reason` in words where it is not OK. A status NONE is no glint at all: rows
+    with fewer than m glints are padded, and a light that does not light the eye has none.
     """
 
     LEADING = 2
@@ -135,12 +149,12 @@ class GlintFeatures(Columns):
         """Whether a glint was found, (n, m)."""
         return np.asarray(self.status == Status.OK)
 
-    def of_light(self, light: int) -> tuple[Floats, Bools]:
-        """Return the position (n, 2) px of one light's glint, and whether it was found (n,)."""
+    def of_light(self, light: int | Ints) -> tuple[Floats, Bools]:
+        """Return the position (n, 2) px of a light's glint, and whether it was found (n,); `light` may be (n,)."""
         n, m = self.light.shape
         if m == 0:
             return np.full((n, 2), np.nan), np.zeros(n, dtype=bool)
-        here = (self.light == light) & self.ok
+        here = (self.light == np.reshape(light, (-1, 1))) & self.ok
         found = here.any(axis=1)
         xy = self.xy_px[np.arange(n), here.argmax(axis=1)]
         return np.where(found[:, None], xy, np.nan), found
@@ -188,6 +202,9 @@ class Observations(ArrayValue):
             "camera": _count(at.camera[i]),
             "eye": EYES[int(at.eye[i])] if at.eye[i] >= 0 else None,
             "eye_model": at.eye_model[i],
+            "subject": _count(at.subject[i]),
+            "instant": _count(at.instant[i]),
+            "time_s": _numbers(at.time_s[i]),
             "target_mm": _numbers(at.target_mm[i]),
             "head_mm": _numbers(at.head_mm[i]),
             "eye_position_mm": _numbers(at.eye_position_mm[i]),
@@ -197,6 +214,7 @@ class Observations(ArrayValue):
                 "torsion_deg": _numbers(np.degrees(pose.torsion_rad[i])),
                 "residual_mm": _numbers(pose.residual_mm[i]),
             },
+            **dict.fromkeys(_UNUSED),
             "pupil": {
                 "status": status.label,
                 "reason": pupil.reason[i] or None,
@@ -209,6 +227,7 @@ class Observations(ArrayValue):
                 "covariance": _numbers(pupil.covariance[i]),
                 "arcs_deg": _points(pupil.arcs_deg[i]),
                 "arc_ellipse": _arc_ellipse(pupil.arc_ellipse[i]),
+                "time_s": None,
             },
             "glints": [
                 {
@@ -218,10 +237,12 @@ class Observations(ArrayValue):
                     "in_image": bool(glints.in_image[i, j]) if glint_status[j] == Status.OK else None,
                     "xy_px": _numbers(glints.xy_px[i, j]),
                     "covariance": _numbers(glints.covariance[i, j]),
+                    "time_s": None,
                 }
                 for j in range(len(glint_status))
                 if glint_status[j] != Status.NONE
             ],
+            **dict.fromkeys(_UNUSED_FEATURES),
         }
 
     @classmethod
@@ -262,6 +283,9 @@ class Observations(ArrayValue):
         found = cls(
             index=Index(
                 frame=reader.frames(),
+                instant=reader.counts("instant"),
+                subject=reader.counts("subject"),
+                time_s=reader.array("time_s", ()),
                 fixation=reader.counts("fixation"),
                 camera=reader.counts("camera"),
                 head=count_heads(head),
@@ -292,6 +316,8 @@ class Observations(ArrayValue):
             ),
             glints=reader.glints(),
         )
+        for key in (*_UNUSED, *_UNUSED_FEATURES, "pupil.time_s"):
+            reader.values(key)
         reader.problems.check()
         return found
 
@@ -467,7 +493,7 @@ def _arc_ellipse(values: Floats) -> dict[str, Any] | None:
 
 
 _ELLIPSE_KEYS = ("centre_px", "semi_axes_px", "angle_rad")
-_NO_GLINT = dict.fromkeys(("light", "status", "reason", "in_image", "xy_px", "covariance"))
+_NO_GLINT = dict.fromkeys(("light", "status", "reason", "in_image", "xy_px", "covariance", "time_s"))
 
 
 def _glint_problem(g: Any) -> str | None:

@@ -98,7 +98,7 @@ class Frames(ArrayValue):
         """Observe the same eyes with another rig that has as many cameras; None changes nothing.
 
         Raises:
-            InputError: the rig has another number of cameras.
+            InputError: the rig has another number of cameras, or one does not see an eye of its frames.
         """
         if rig is None or (built := rig.build()) == self.scene.rig:
             return self
@@ -107,6 +107,9 @@ class Frames(ArrayValue):
                 f"are {len(built.cameras)}, but the frames were made for {len(self.scene.rig.cameras)}",
                 path="rig.cameras",
             )
+        for eye, camera in set(zip(self.index.eye.tolist(), self.index.camera.tolist(), strict=True)):
+            if not built.cameras[camera].sees(EYES[eye]):
+                raise InputError(f"does not see the {EYES[eye]} eye of these frames", path=f"rig.cameras.{camera}.eyes")
         return self.of_scene(self.scene.replaced(rig=built))
 
     def of_scene(self, scene: Scene) -> Self:
@@ -291,6 +294,18 @@ class Scene:
         same = spec.eye.model == self.spec.eye.model
         return self.replaced(spec, eye_spec=None if same else spec.eye.spec(self.base))._checked()
 
+    def of_first_eye(self) -> Scene:
+        """Return the scene with the part of its rig that its first eye meets (`Rig.of_eye`).
+
+        Raises:
+            InputError: no camera sees the eye, or no LED lights it.
+        """
+        side = self.spec.subject.eyes[0]
+        if (rig := self.spec.rig.of_eye(side)) is self.spec.rig:
+            return self
+        subject = self.spec.subject.model_copy(update={"eyes": (side,)})
+        return self.replaced(self.spec.model_copy(update={"rig": rig, "subject": subject}))
+
     @property
     def name(self) -> str:
         """Name of the scene."""
@@ -311,7 +326,8 @@ class Scene:
     def person_numbers(self, side: str) -> dict[str, dict[str, float | int | str]]:
         """Return the person's identity and the numbers of the person and this eye, as metadata of images.
 
-        Empty if no person is drawn. Dots in names become underscores, because the names serve as column names.
+        Empty if no person is drawn. Dots in names become underscores, because the names serve as column names. The name
+        of the entrance pupil says that it is that at the table's luminance, not that of an image.
         """
         person = self.spec.person
         if person is None:
@@ -321,6 +337,9 @@ class Scene:
             name.replace(".", "_"): value[k] if isinstance(value, tuple) else value
             for name, value in person.numbers.items()
         }
+        if "entrance_pupil_mm" in numbers:
+            luminance = default_table().constant("luminance_cd_m2")
+            numbers[f"entrance_pupil_at_{luminance:g}_cd_m2_mm"] = numbers.pop("entrance_pupil_mm")
         who: dict[str, float | int | str] = {"preset": person.preset, "seed": person.seed, "subject": person.subject}
         return {"person": {**who, "sex": person.sex, **numbers}}
 
@@ -480,25 +499,25 @@ class Scene:
         return targets_of(self.spec, self.rig)
 
     def index(self) -> Index:
-        """Return the index of all (frame, eye) of the scene, in order; n rows."""
+        """Return the index of all (frame, eye) of the scene, in order; n rows.
+
+        A camera has no row of an eye that it does not see.
+        """
         spec = self.spec
         targets = self.targets_mm
         fixations = len(targets) if targets is not None else len(spec.poses or ())
         heads = np.array(spec.subject.head_positions_mm, dtype=float)
         sides = np.array(sorted(EYES.index(e) for e in spec.subject.eyes))
         cameras = len(self.rig.cameras)
-        head, fixation, camera, side = (
-            a.ravel()
-            for a in np.meshgrid(
-                np.arange(len(heads)), np.arange(fixations), np.arange(cameras), np.arange(len(sides)), indexing="ij"
-            )
-        )
-        n = len(head)
-        eye = sides[side]
+        seen = np.array([[camera.sees(EYES[side]) for side in sides] for camera in self.rig.cameras])
+        head, fixation, camera, side = np.nonzero(np.broadcast_to(seen, (len(heads), fixations, *seen.shape)))
+        n, eye = len(head), sides[side]
+        instant = head * fixations + fixation
         model = np.empty(n, dtype=object)
         model[:] = self.eye_name
         return Index(
-            frame=(head * fixations + fixation) * cameras + camera,
+            frame=instant * cameras + camera,
+            instant=instant,
             fixation=fixation,
             camera=camera,
             head=head,
@@ -508,6 +527,12 @@ class Scene:
             head_mm=heads[head],
             eye_position_mm=np.stack([self.eye_position_mm(EYES[e]) for e in (0, 1)])[eye],
         )
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames: one for each head position, fixation and camera, whether it sees an observed eye or not."""
+        fixations = len(self.spec.poses or ()) if self.targets_mm is None else len(self.targets_mm)
+        return len(self.spec.subject.head_positions_mm) * fixations * len(self.rig.cameras)
 
     def frames(self) -> Frames:
         """Compute the pose of every (frame, eye) of the scene: the given one, or the one that fixates the target.
@@ -560,14 +585,17 @@ class Scene:
     def windows(self) -> dict[tuple[int, int, int], Window]:
         """Compute the image window (x0, y0, width, height) of each (camera, head position, eye), in full-sensor pixels.
 
+        A camera has no window of an eye that it does not see.
+
         A window is centred on the image of the unrotated eye's apex, so it does not move with the gaze; it is kept on
         the sensor. Without `image.window_px` it is the whole sensor for one eye, and `EYE_WINDOW_MM` for two.
         """
         return {
             (c, k, EYES.index(side)): self.window(c, k, EYES.index(side))
-            for c in range(len(self.rig.cameras))
+            for c, camera in enumerate(self.rig.cameras)
             for k in range(len(self.spec.subject.head_positions_mm))
             for side in self.spec.subject.eyes
+            if camera.sees(side)
         }
 
     def window(self, camera: int, head: int, eye: int) -> Window:
@@ -587,9 +615,9 @@ class Scene:
             return self.spec.image.window_px
         view = self.rig.cameras[camera]
         w, h = view.resolution_px
-        positions = [self.eye_position_mm(side) for side in self.spec.subject.eyes]
+        positions = [self.eye_position_mm(side) for side in self.spec.subject.eyes if view.sees(side)]
         # A camera inside an eye has no defined image scale.
-        if len(positions) == 1 or any(np.array_equal(position, view.nodal_point_mm) for position in positions):
+        if len(positions) <= 1 or any(np.array_equal(position, view.nodal_point_mm) for position in positions):
             return w, h
         scale = max(map(view.scale_at, positions))
         width, height = (16 * math.ceil(side_mm * scale / 16) for side_mm in EYE_WINDOW_MM)

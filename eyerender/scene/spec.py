@@ -20,10 +20,11 @@ from ..eye.spec import EyeSpec
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
+from ..rig.camera import EyeNames
 from ..rig.imaging import Ambient, Lens, Motion, Picture
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
-from .observation import MAX_GLINTS
+from .observation import EYES, MAX_GLINTS
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -104,9 +105,7 @@ Accommodation = Annotated[
 class SubjectSpec(Spec):
     """The eyes of the subject, their distance, and the head positions."""
 
-    eyes: Annotated[tuple[Literal["right", "left"], ...], Field(min_length=1, max_length=2)] = Field(
-        default=("right", "left"), description="the eyes that are observed"
-    )
+    eyes: EyeNames = Field(default=("right", "left"), description="the eyes that are observed")
     ipd_mm: Positive = Field(
         default=63.0,
         description="distance of the corneal apexes of the unrotated eyes, which the paper calls interpupillary "
@@ -133,12 +132,6 @@ class SubjectSpec(Spec):
         description="age of eyes that are not drawn, for light and accommodation; default: 28.58, about which the "
         "formula of the pupil turns",
     )
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if len(set(self.eyes)) != len(self.eyes):
-            raise ValueError("eyes: name each eye only once")
-        return self
 
 
 class Targets(Spec):
@@ -308,7 +301,10 @@ class SceneSpec(FileSpec):
         else:
             fixations = len(targets.screen_mm or targets.world_mm or ())
         heads, cameras, eyes = len(self.subject.head_positions_mm), len(self.rig.cameras), len(self.subject.eyes)
-        count = fixations * heads * cameras * eyes
+        views = sum(side in (camera.eyes or EYES) for camera in self.rig.cameras for side in self.subject.eyes)
+        if views == 0:
+            raise KeyProblem("rig.cameras", f"none sees the {' or the '.join(self.subject.eyes)} eye of `subject.eyes`")
+        count = fixations * heads * views
         if count > MAX_OBSERVATIONS:
             raise ValueError(
                 f"{fixations} fixations, {heads} head positions, {cameras} cameras and {eyes} eyes make {count} "

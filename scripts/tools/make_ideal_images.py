@@ -406,7 +406,7 @@ def _record(pupil: _Conic, glints: list[dict[str, Any]], seed: int) -> dict[str,
     """A record of the package's schema; keys that an ideal image does not have are null."""
     axes, angle = pupil.semi, pupil.angle % math.pi
     return {
-        "schema": "eyerender/record/2", "frame": seed, "fixation": None, "camera": 0, "eye": None, "eye_model": None,
+        "schema": "eyerender/record/3", "frame": seed, "fixation": None, "camera": 0, "eye": None, "eye_model": None,
         "target_mm": None, "head_mm": None, "eye_position_mm": None, "pose": None,
         "pupil": {
             "status": "ok", "reason": None, "in_image": True, "centre_px": pupil.centre.tolist(),

@@ -159,9 +159,9 @@ def test_partial_and_whole_pupils_come_back_from_their_records():
 
 def test_a_record_of_another_version_is_refused_with_both_versions():
     (line,) = trace(scene(40.0)).records()
-    words = "records.0.schema: is 'eyerender/record/1'; this version reads 'eyerender/record/2'"
+    words = "records.0.schema: is 'eyerender/record/2'; this version reads 'eyerender/record/3'"
     with pytest.raises(InputError, match=words):
-        Observations.from_records([{**line, "schema": "eyerender/record/1"}])
+        Observations.from_records([{**line, "schema": "eyerender/record/2"}])
 
 
 def test_a_damaged_partial_record_is_refused_by_name():

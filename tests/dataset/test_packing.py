@@ -14,7 +14,7 @@ from eyerender.dataset.assemble import assemble, verify_dataset
 from eyerender.dataset.maker import MadeImage, MadeSample
 from eyerender.dataset.merge import merge
 from eyerender.dataset.partial import PartialShard, reopen
-from eyerender.dataset.realise import image_line, realise
+from eyerender.dataset.realise import realise, sample_line
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import Staged, commit
 from eyerender.dataset.status import status
@@ -33,7 +33,7 @@ def sample_of(made, index):
     labels = known_labels(found.scene, found.observations, view)
     labels["pupil"]["visible"] = {"pixels": 5}
     labels["glints"] = [{**glint, "visible": True} for glint in labels["glints"]]
-    name, line = image_line(found, 0, 1, view.window, labels)
+    name, line = sample_line(found, 0, 1, view.window, labels)
     noise = np.random.default_rng(index).integers(0, 4, size=(2, 72, 96))
     pictures = {"images": noise[0].astype(np.uint16), "masks": noise[1].astype(np.uint8)}
     return MadeSample(index, (MadeImage(name, pictures, line, False),), ())

@@ -111,7 +111,7 @@ def _folder(path: Path) -> Any:
 
 def _folder_seeds() -> list[bytes]:
     record = json.loads(_record_seeds()[0])
-    line: dict[str, Any] = {"schema": "eyerender/image/3", "file_name": "images/a.png", "mask_file_name": "masks/a.png"}
+    line: dict[str, Any] = {"schema": "eyerender/image/5", "file_name": "images/a.png", "mask_file_name": "masks/a.png"}
     line |= {"window_px": {"x0": 0, "y0": 0, "width": 4, "height": 4}, "bit_depth": 8, "gamma": 1.0}
     both: list[dict[str, Any]] = [{"records": [record], "labels": {}}, {"records": []}]
     return [json.dumps({**line, **more}).encode() for more in both]

@@ -149,7 +149,7 @@ def test_the_commands_work_without_a_screen(head_mounted, tmp_path, monkeypatch,
 
 def test_records_without_places_have_no_directions():
     seen = Observations.from_records(
-        [{"schema": "eyerender/record/2", "eye": "right", "target_mm": [900, 0, 0], "pupil": {"centre_px": [1, 2]}}]
+        [{"schema": "eyerender/record/3", "eye": "right", "target_mm": [900, 0, 0], "pupil": {"centre_px": [1, 2]}}]
     )
     rig = load_scene("head_mounted").rig
     with pytest.raises(InputError, match="right eye: 0 usable calibration targets"):

@@ -9,7 +9,7 @@ import pytest
 
 import eyerender as er
 from eyerender.dataset.plan import Plan
-from eyerender.dataset.realise import image_line, realise, windows_of
+from eyerender.dataset.realise import realise, sample_line, windows_of
 from eyerender.eye.entrance import entrance_pupil_mm
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.refraction import at_cornea_d
@@ -162,7 +162,7 @@ def test_a_dataset_draws_its_subjects():
         found = realise(plan, index)
         assert found.scene.spec.person == people.person(index // 2)
         row = index % 2
-        _, line = image_line(found, row, 1, windows_of(found.scene, found.observations)[row], {})
+        _, line = sample_line(found, row, 1, windows_of(found.scene, found.observations)[row], {})
         told = line["parameters"]["person"]
         assert told["axial_length_mm"] == people["axial_length_mm"][index // 2, row]
         assert told["skin_albedo"] == people["skin.albedo"][index // 2]

@@ -127,7 +127,7 @@ def _line(row: int, name: str, size: tuple[int, int], given: dict[str, Any], tex
     labels = {key: value for key, value in given.items() if key not in ("yaw", "pitch", "diameter")}
     subject, outline = row // FRAMES, labels["pupil"]["amodal"]
     record = {
-        "schema": "eyerender/record/2", "frame": row, "camera": 0, "eye": "right",
+        "schema": "eyerender/record/3", "frame": row, "camera": 0, "eye": "right",
         "pose": {"azimuth_deg": given["yaw"], "elevation_deg": given["pitch"]},
         "pupil": {key: outline[key] for key in ("status", "centre_px", "semi_axes_px", "angle_rad")},
         "glints": [{"light": g["light"], "status": "ok", "xy_px": g["xy_px"]} for g in labels["glints"]],
@@ -139,7 +139,7 @@ def _line(row: int, name: str, size: tuple[int, int], given: dict[str, Any], tex
         "lens.star": row % 3,
     }
     return {
-        "schema": "eyerender/image/4", "file_name": f"images/{name}", "mask_file_name": f"masks/{name}",
+        "schema": "eyerender/image/5", "file_name": f"images/{name}", "mask_file_name": f"masks/{name}",
         "sample": row, "subject": subject, "split": SPLITS[subject % len(SPLITS)], "sequence_index": row % FRAMES,
         "window_px": dict(zip(("x0", "y0", "width", "height"), (0, 0, *size), strict=True)),
         "bit_depth": 8, "gamma": 1.0, "records": [record], "labels": labels,

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from eyerender.analytic.observer import trace
-from eyerender.imaging.labels import seen_labels
+from eyerender.imaging.labels import image_labels
 
 
 def labels_of(image):
     """The labels of an image without its folder."""
-    return seen_labels(replace(image, row=0), trace(image.frame))
+    return image_labels(replace(image, row=0), trace(image.frame))

@@ -6,7 +6,7 @@
                     or  {"id", "error": "why this image could not be processed"}
 
 Every line is one object. The greeting comes once, then an answer to each request in turn; the extractor ends with its
-input. The record is the package's (eyerender/record/2). Only `pupil.status` is required, and with "ok" centre, axes and
+input. The record is the package's (eyerender/record/3). Only `pupil.status` is required, and with "ok" centre, axes and
 angle: either `semi_axes_px` and `angle_rad`, whose names define them, or `axes_px` and `angle` as `conventions`
 declares. Places are relative to the image.
 """

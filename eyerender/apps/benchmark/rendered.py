@@ -100,7 +100,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> BenchImage:
         visible=visible,
         glints=tuple(shown),
         factors=factors | factors_of(ellipse, visible),
-        subject=str(entry.line.get("subject", "")),
+        subject="" if entry.line.get("subject") is None else str(entry.line["subject"]),
         iris=_iris(labels, corner),
         lids_px=tuple(np.asarray(lids[lid], dtype=np.float64).reshape(-1, 2) - corner for lid in sorted(lids)),
         mask_path=entry.mask_path,
@@ -124,8 +124,7 @@ def _iris(labels: Mapping[str, Any], corner: Floats) -> Ellipse | None:
 
 
 def _visible(labels: Mapping[str, Any]) -> float | None:
-    pupil = labels.get("pupil")
-    value = pupil.get("visible_fraction") if isinstance(pupil, dict) else labels.get("pupil_visible_fraction")
+    value = (labels.get("pupil") or {}).get("visible_fraction")
     return float(value) if value is not None else None
 
 

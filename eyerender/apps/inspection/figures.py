@@ -36,7 +36,7 @@ def groups_of(entry: ImageEntry) -> dict[str, str]:
     """Return the groups to which an image belongs: split, camera, eye, and whatever of its person is text."""
     line, record = entry.line, _first(entry)
     found = {
-        "split": str(line.get("split", "")),
+        "split": str(line.get("split") or ""),
         "camera": str(record.get("camera", "")),
         "eye": str(record.get("eye", "")),
     }

@@ -207,7 +207,7 @@ def _each(entries: Entries, rows: Sequence[int]) -> Iterator[ImageEntry | Fault]
 def _read_image(row: int, entry: ImageEntry) -> _Row:
     line, faults = entry.line, list[Fault]()
     numbers: dict[str, float] = {}
-    groups = {"split": str(line.get("split", ""))}
+    groups = {"split": str(line.get("split") or "")}
     try:
         faults += contradictions(entry)
         numbers, groups = numbers_of(entry), groups_of(entry)

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -332,7 +332,7 @@ class Tab:
 
     def _show(self, **fields: Any) -> None:
         """Show another eye, or another camera's image."""
-        self._apply(lambda setup: replace(setup, **fields), refresh=True)
+        self._apply(lambda setup: setup.showing(**fields), refresh=True)
 
     def _follow(self, fixation: int) -> None:
         if fixation >= 0:

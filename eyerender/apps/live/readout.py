@@ -28,7 +28,7 @@ def calibrated(setup: Setup) -> Regression | None:
     index = frames.index
     shown = (index.camera == setup.camera) & (index.eye == EYES.index(setup.eye))
     seen = trace(frames.take(np.flatnonzero(shown)))
-    vectors, reasons = pupil_glint_vectors(seen, normalised=False)
+    vectors, reasons = pupil_glint_vectors(seen, normalised=False, rig=scene.rig)
     function = highest_determined(vectors[[reason is None for reason in reasons]])
     if function is None:
         return None
@@ -59,11 +59,12 @@ def feature_table(truth: Observations, found: Observations | None, hidden: tuple
     Args:
         truth: observation of the analytic observer, one row.
         found: observation of the image observer, one row; None if not requested.
-        hidden: what hides the glint of each light in the scene ("" or "visible" if nothing does).
+        hidden: what hides the glint of each light of this eye in the scene ("" or "visible" if nothing does).
     """
     rows = [_pupil_row(truth, found)]
-    for k, light in enumerate(truth.glints.light[0]):
-        rows.append(_glint_row(truth, found, k, int(light), hidden[int(light)] if int(light) < len(hidden) else ""))
+    for number, k in enumerate(np.flatnonzero(truth.glints.light[0] >= 0)):
+        light, hider = int(truth.glints.light[0, k]), hidden[number] if number < len(hidden) else ""
+        rows.append(_glint_row(truth, found, int(k), light, hider))
     names = ("px", "analytic", "in the scene", "extracted", "difference")
     head = "".join(f"<th>{name}</th>" for name in names)
     return f"<table><tr>{head}</tr>{''.join(rows)}</table>"

@@ -49,8 +49,8 @@ class Setup:
         if spec.person is not None or spec.subject.accommodation_d == "targets":
             demand = min(demand_d(spec, scene.targets_mm), MOST_ACCOMMODATION_D)
             scene = scene.with_({"subject.accommodation_d": demand})
-        start = cls(origin=spec, scene=scene, eye=spec.subject.eyes[0])
-        return start.following(0).with_head(0)
+        start = cls(origin=spec, scene=scene, eye=EYES[scene.index().eye[0]])
+        return start.showing(eye=start.eye).following(0).with_head(0)
 
     @property
     def fixations(self) -> int:
@@ -72,6 +72,21 @@ class Setup:
         """Return the selected row of `frames`."""
         index = frames.index
         return int(np.flatnonzero((index.camera == self.camera) & (index.eye == EYES.index(self.eye)))[0])
+
+    def showing(self, *, eye: str | None = None, camera: int | None = None) -> Self:
+        """Select an eye or a camera, and with it a camera that sees the eye or an eye that the camera sees.
+
+        Raises:
+            InputError: the camera sees no observed eye.
+        """
+        index = self.scene.index()
+        seen = list(zip(index.camera.tolist(), [EYES[side] for side in index.eye], strict=True))
+        chosen = (self.camera if camera is None else camera, self.eye if eye is None else eye)
+        fitting = [pair for pair in seen if (camera in (None, pair[0])) and (eye in (None, pair[1]))]
+        if not fitting:
+            raise InputError(f"does not see the {chosen[1]} eye", path=f"rig.cameras.{chosen[0]}.eyes")
+        number, side = chosen if chosen in fitting else fitting[0]
+        return replace(self, camera=number, eye=side)
 
     def changed(self, changes: Mapping[str, Any]) -> Self:
         """Change keys of the scene by their paths."""
@@ -128,7 +143,8 @@ class Setup:
 
     def without_camera(self, camera: int) -> Self:
         """Remove a camera and select the first one."""
-        return replace(self._with_rig(self.scene.spec.rig.without_camera(camera)), camera=0)
+        fewer = self._with_rig(self.scene.spec.rig.without_camera(camera))
+        return replace(fewer, camera=0).showing(eye=fewer.eye)
 
     def with_focal_length(self, camera: int, focal_length: float) -> Self:
         """Change a camera's focal length, in the unit used by the scene (mm or px)."""

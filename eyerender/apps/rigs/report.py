@@ -33,6 +33,7 @@ from ...optics.transforms import direction_of
 from ...population.people import Person
 from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
 from ...report.style import heat_map
+from ...rig.rig import RigGeometry
 from ...scene import Scene
 from ...scene.people import Population
 from ...scene.spec import SceneSpec, Targets
@@ -71,7 +72,8 @@ def run_rig(
     """Evaluate a scene's rig over a population; write report.html, summary.json, people.csv and gaze.csv into a folder.
 
     Args:
-        scene: provides the rig, sensor, first eye and first head position.
+        scene: provides the rig, sensor, first eye and first head position; cameras and LEDs that serve only the other
+            eye count for eye safety alone.
         population: the people.
         output: the folder.
         size: number of people, and range of gaze.
@@ -83,6 +85,7 @@ def run_rig(
     Raises:
         InputError: the folder is not empty, or no drawn eye is physically possible.
     """
+    whole, scene = scene, scene.of_first_eye()
     survey = RigPopulation(
         scene=scene.located().to_mapping(),
         population=population.to_mapping(),
@@ -103,7 +106,7 @@ def run_rig(
             survey, found.subject[: size.images].tolist(), progress, images=True, backend=backend
         )
         slipped = figures_of_shifts(survey, noise, min(_SLIPPING, size.people), workers=size.workers)
-        data = summary(scene, survey, found, biases, noise)
+        data = summary(scene, survey, found, biases, noise, whole.rig)
         data["estimators_on_images"] = _errors_of(pictured)
         data["slippage"] = _slippage_of(*slipped)
         write_json(folder / SUMMARY, data)
@@ -184,13 +187,18 @@ def _scene_of(survey: RigPopulation, subject: int, cells: Ints) -> Scene:
 
 
 def summary(
-    scene: Scene, survey: RigPopulation, found: Figures, biases: Sequence[Bias], noise: FeatureNoise
+    scene: Scene,
+    survey: RigPopulation,
+    found: Figures,
+    biases: Sequence[Bias],
+    noise: FeatureNoise,
+    whole: RigGeometry,
 ) -> dict[str, Any]:
-    """Return the content of summary.json."""
+    """Return the content of summary.json; all LEDs of the `whole` rig count for eye safety."""
     side = scene.spec.subject.eyes[0]
     place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
     try:
-        safety: dict[str, Any] = eye_exposure(scene.rig, place, wavelength_nm=scene.spec.wavelength_nm).to_mapping()
+        safety: dict[str, Any] = eye_exposure(whole, place, wavelength_nm=scene.spec.wavelength_nm).to_mapping()
     except InputError as error:
         safety = {"note": NOTE, "reason": str(error)}
     lights = len(scene.rig.lights) * len(scene.rig.cameras)

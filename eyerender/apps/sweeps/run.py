@@ -161,15 +161,16 @@ def _evaluated(
 
 def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
     """Evaluate one layout: choose its LEDs, and compute bound, dropout and exposure over the population."""
-    survey = _survey(spec, layout.scene)
-    scene = Scene.of(SceneSpec.from_mapping(layout.scene))
+    whole = Scene.of(SceneSpec.from_mapping(layout.scene))
+    scene = whole.of_first_eye()
+    survey = _survey(spec, scene.spec.to_mapping())
     sites, chosen = len(scene.rig.lights), tuple(range(len(scene.rig.lights)))
     if layout.lights < sites:
         (known,) = sites_seen(survey, [noise_of_some(scene, layout.lights)], min(CHOOSERS, spec.people))
         chosen = choose_lights(known, layout.lights)
-        leds = [layout.scene["rig"]["lights"][k] for k in chosen]
-        data = {**layout.scene, "rig": {**layout.scene["rig"], "lights": leds}}
-        survey, scene = _survey(spec, data), Scene.of(SceneSpec.from_mapping(data))
+        lights = [scene.spec.rig.lights[k] for k in chosen]
+        scene = scene.with_({"rig.lights": lights})
+        survey = _survey(spec, scene.spec.to_mapping())
     found = figures_of(survey, sensor_noise(scene), 0, spec.people)
     if not len(found.subject):
         raise InputError("no eye of this population is physically possible", path="population")

@@ -325,6 +325,6 @@ def _surveyed(item: Item) -> _Surveyed:
         split=item.split,
         bit_depth=item.bit_depth,
         size=item.entry.window[2:],
-        lights=len(item.line["labels"]["glints"]),
+        lights=len(item.line["labels"]["lights_mm"]),
         file_name_bytes=len(item.entry.name.encode()),
     )

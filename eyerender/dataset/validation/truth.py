@@ -18,8 +18,9 @@ from ...analytic.observer import trace
 from ...base.arrays import Bools, Floats
 from ...base.errors import InputError
 from ...base.storage.files import parse_json, shown
-from ...folders.imagefolder import DATASET, KINDS, RESULTS, ImageFolder, shard_name, versions
+from ...folders.imagefolder import DATASET, FILE_KEYS, KINDS, RESULTS, ImageFolder, shard_name, versions
 from ...imaging.labels import EyeInWindow, known_labels, limbus_px
+from ...imaging.lines import image_line
 from ...region.mesh import lid_margins
 from ...rendering.glints.tracing import GlintScene, glint_table
 from ...rendering.records.job import film_index, globe_of
@@ -30,7 +31,7 @@ from ...scene.spec import SceneSpec
 from ..done import picture_file
 from ..ownscenes import GivenScene
 from ..plan import Plan, plan_digest
-from ..realise import Realised, frames_of, image_line, image_name, realise
+from ..realise import Realised, frames_of, image_name, realise, sample_line
 from .problems import WRONG, FolderProblems, differences
 
 # Rays are traced to 1e-9 mm, and mathematical functions of other machines change the last digits: 1e-8 px at the
@@ -115,8 +116,8 @@ class DatasetTruth:
         # The exposure that a subject got is in its scenes.
         spec = plan.spec.model_copy(update={"auto_exposure": None})
         plan = replace(plan, spec=spec, scenes=replace(plan.scenes, function=stored))
-        frames = plan.draw(first["sample"], first["parameters"]["attempt"]).build().frames()
-        return cls(plan=plan, frames=int(frames.index.frame.max()) + 1, stale=stale, stored=stored)
+        scene = plan.draw(first["sample"], first["parameters"]["attempt"]).build()
+        return cls(plan=plan, frames=scene.frame_count, stale=stale, stored=stored)
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
         """Return the subject, split and file names that a line must have; raise one of `WRONG` or `InputError`."""
@@ -144,7 +145,7 @@ class DatasetTruth:
         if row is None:
             return Again((f"sample {number} has no such image",))
         scene, view = frames.scene, EyeInWindow.of(frames, row)
-        _, expected = image_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
+        _, expected = sample_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
         texts = ("scene_json", "eye_json")
         problems = _differences(_open(expected, texts), _open(line, texts))
         problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
@@ -209,22 +210,9 @@ class SceneTruth:
         if row is None:
             return Again(("the scene has no such image",))
         view = EyeInWindow.of(self.frames, row)
-        expected = {
-            "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
-            "bit_depth": scene.spec.sensor.bit_depth,
-            "gamma": scene.spec.sensor.gamma,
-            "records": list(found.take([row]).records()),
-            "parameters": {
-                "eye_model": scene.eye_name,
-                "pupil_diameter_mm": scene.stop_diameter_mm(record["eye"]),
-                "wavelength_nm": scene.spec.wavelength_nm,
-                "spp": scene.spec.image.spp,
-                "seed": scene.spec.seed,
-                "camera": view.camera,
-                **scene.person_numbers(record["eye"]),
-            },
-        }
-        problems = [*_differences(expected, line), *_lids(scene, found, view, line)]
+        (own,) = found.take([row]).records()
+        expected = image_line(scene, own, view.window, known_labels(scene, found, view))
+        problems = [*_differences(expected, line), *_spots(scene, view, line), *_lids(scene, found, view, line)]
         return Again(tuple(problems), _limbus(scene, view))
 
 
@@ -255,7 +243,8 @@ def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
-    return _summed(differences(expected, line, TOLERANCE))
+    # `whose` gives the names of files.
+    return _summed(differences({k: v for k, v in expected.items() if k not in FILE_KEYS}, line, TOLERANCE))
 
 
 def _summed(texts: Iterator[str]) -> list[str]:
@@ -275,8 +264,9 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
     """Check the spots of the glints: each is the mean of the lamp's image, or lies within it if a part is hidden."""
     eye, camera = view.eye, scene.rig.cameras[view.camera]
     mirror = GlintScene.of(eye, film_index(eye, scene.spec.look), view.M, view.t, camera, None)
-    images = mirror.images(scene.rig.lights, scene.spec.sensor.psf_sigma_px)
-    glints = mirror.glints(scene.rig.lights, images, _all_clear)
+    lights = [scene.rig.lights[k] for k in scene.rig.lights_of(EYES.index(eye.side))]
+    images = mirror.images(lights, scene.spec.sensor.psf_sigma_px)
+    glints = mirror.glints(lights, images, _all_clear)
     picture = scene.spec.image
     # The glints of a meshed cornea are off by some thousandths of a pixel at the default edge of 0.1 mm.
     spare = SPOT_PX + (2 * picture.mesh_edge_mm**2 if picture.surfaces == "mesh" else 0.0)

@@ -35,7 +35,7 @@ def test_a_head_behind_the_camera_gives_images_that_show_nothing(tmp_path, capsy
     assert run(["render", str(scene), "-o", str(out)]) == 0
     for entry in ImageFolder.load(out).entries:
         labels, (record,) = entry.line["labels"], entry.line["records"]
-        assert labels["pupil_visible_fraction"] is None
+        assert labels["pupil"]["visible_fraction"] is None
         assert record["pupil"]["status"] == "missing"
         assert record["pupil"]["reason"]
         assert [g["status"] for g in record["glints"]] == ["missing"]

@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.folders.imagefolder import RENDERED_SCHEMA, ImageFolder
+from eyerender.folders.imagefolder import IMAGE_SCHEMA, ImageFolder
 from eyerender.imaging.autoexposure import auto_exposed
 from eyerender.imaging.capture import noiseless, render_job, render_windows
 from eyerender.imaging.folder import render_folder
@@ -124,7 +124,7 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     render_folder(given, tmp_path / "out", threads=1)
     folder = ImageFolder.load(tmp_path / "out")
     (entry,) = folder
-    assert (entry.line["schema"], entry.gamma) == (RENDERED_SCHEMA, 2.2)
+    assert (entry.line["schema"], entry.gamma) == (IMAGE_SCHEMA, 2.2)
     mask = entry.mask()
     assert (mask[:12] == FRAME).all()
     assert (mask[-12:] == FRAME).all()

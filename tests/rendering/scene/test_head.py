@@ -151,9 +151,9 @@ def test_the_opening_is_where_its_edge_projects(renderer, folder, side):
     np.testing.assert_allclose(depths_mm(renderer, render_job(scene.frames(), 0))[skin], distance, rtol=1e-5)
     # The second lamp's glint lies high on the cornea, under the upper lid; the first stands free.
     labels = labels_of(image)
-    assert [g["reason"] for g in labels["glints"]] == ["visible", "occluded by lid"]
+    assert [g["hidden_by"] for g in labels["glints"]] == ["visible", "occluded by lid"]
     assert labels["lid_margins_px"] is None
-    assert 0.5 < labels["iris_visible_fraction"] < 1
+    assert 0.5 < labels["iris"]["visible_fraction"] < 1
     assert image.irradiance[skin].min() > 0
 
 
@@ -173,7 +173,7 @@ def test_reasons_name_the_part(renderer, folder, part, word):
     columns = slice(int(np.ceil(xy[:, 0].min())) + 1, int(xy[:, 0].max()) - 1)
     assert free.parts[rows, columns].min() > 0
     assert barred.parts[rows, columns].max() == 0
-    lost = labels_of(free)["pupil_visible_fraction"] - labels_of(barred)["pupil_visible_fraction"]
+    lost = labels_of(free)["pupil"]["visible_fraction"] - labels_of(barred)["pupil"]["visible_fraction"]
     assert 0.05 < lost < 0.4
 
 
@@ -303,8 +303,10 @@ def test_the_own_region_as_a_head_hides_what_it_hides(renderer, tmp_path):
     head = only(scene_of(tmp_path, {"file": "manifest.json"}, **matte), renderer)
     own = only(Scene.of(SceneSpec.from_mapping({**scene_data({}), "region": dry, **matte})), renderer)
     assert np.mean(head.parts != own.parts) < 1e-4  # the file keeps five digits
-    assert [g["reason"] for g in labels_of(head)["glints"]] == [g["reason"] for g in labels_of(own)["glints"]]
-    assert labels_of(head)["iris_visible_fraction"] == pytest.approx(labels_of(own)["iris_visible_fraction"], abs=1e-3)
+    assert [g["hidden_by"] for g in labels_of(head)["glints"]] == [g["hidden_by"] for g in labels_of(own)["glints"]]
+    assert labels_of(head)["iris"]["visible_fraction"] == pytest.approx(
+        labels_of(own)["iris"]["visible_fraction"], abs=1e-3
+    )
     # Much the same skin sends much the same light to the globe: a head's has neither relief nor patches of oil. With
     # sixteen times as many rays between surfaces, the sclera is 2.1 % brighter, the iris 1.1 %.
     for part in (1, 2):

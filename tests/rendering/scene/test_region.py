@@ -63,25 +63,25 @@ def test_the_eye_between_open_lids_is_the_bare_eye(renderer):
     ratio = whole.irradiance[clear] / bare.irradiance[clear]
     assert np.median(ratio) == pytest.approx(1.0, abs=2e-3)
     assert np.percentile(ratio, 99) < 1.01
-    assert labels_of(whole)["pupil_visible_fraction"] == 1.0
-    assert 0.7 < labels_of(whole)["iris_visible_fraction"] < 1.0
+    assert labels_of(whole)["pupil"]["visible_fraction"] == 1.0
+    assert 0.7 < labels_of(whole)["iris"]["visible_fraction"] < 1.0
 
 
 def test_a_shut_lid_hides_pupil_and_glint_and_says_so(renderer):
     open_, half, shut = (
         images(renderer, region={"blink": b, "lashes": {"upper_count": 0}})[0] for b in (0.0, 0.5, 1.0)
     )
-    shares = [labels_of(i)["pupil_visible_fraction"] for i in (open_, half, shut)]
+    shares = [labels_of(i)["pupil"]["visible_fraction"] for i in (open_, half, shut)]
     assert shares[0] == 1.0
     assert 0.0 < shares[1] < 1.0
     assert shares[2] == 0.0
-    assert [labels_of(i)["glints"][0]["reason"] for i in (open_, shut)] == ["visible", "occluded by lid"]
+    assert [labels_of(i)["glints"][0]["hidden_by"] for i in (open_, shut)] == ["visible", "occluded by lid"]
     assert not shut.rendered.glints.visible.any()
     assert open_.rendered.glints.visible.all()
-    assert labels_of(open_)["pupil_visible_arcs_deg"] == [[0.0, 360.0]]
-    assert labels_of(shut)["pupil_visible_arcs_deg"] == []
+    assert labels_of(open_)["pupil"]["visible_arcs_deg"] == [[0.0, 360.0]]
+    assert labels_of(shut)["pupil"]["visible_arcs_deg"] == []
     # What is left of a half hidden pupil is its lower part: image y runs down, so angles from 0 to 180.
-    ((start, end),) = labels_of(half)["pupil_visible_arcs_deg"]
+    ((start, end),) = labels_of(half)["pupil"]["visible_arcs_deg"]
     middle = (start + ((end - start) % 360) / 2) % 360
     assert abs(middle - 90) < 25
 

@@ -1,0 +1,61 @@
+"""The line of metadata of an image, the same for rendered folders and datasets (docs/formats.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..folders.imagefolder import FILE_KEYS, IMAGE_SCHEMA
+from ..rig.camera import Window
+from ..scene import Scene
+
+SAMPLE_KEYS = ("sample", "split", "sequence_index")
+DRAWN_KEYS = ("attempt", "subject_attempt", "draws", "scene_json", "eye_json")
+"""Keys of a line and of its `parameters` that only a dataset's lines fill."""
+
+
+def image_line(
+    scene: Scene,
+    record: Mapping[str, Any],
+    window: Window,
+    labels: Mapping[str, Any],
+    *,
+    sample: Mapping[str, Any] | None = None,
+    drawn: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the line of an image; the keys of files are null.
+
+    Args:
+        scene: the rendered scene.
+        record: the record of the eye that it shows.
+        window: (x0, y0, width, height) in full-sensor pixels.
+        labels: its labels.
+        sample: values of `SAMPLE_KEYS`, in a dataset.
+        drawn: values of `DRAWN_KEYS`, in a dataset.
+    """
+    spec = scene.spec
+    return {
+        "schema": IMAGE_SCHEMA,
+        **dict.fromkeys(FILE_KEYS),
+        **dict.fromkeys(SAMPLE_KEYS),
+        **(sample or {}),
+        **{key: record[key] for key in ("subject", "instant", "time_s", "rig_pose")},
+        "timestamp_s": None,
+        "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
+        "bit_depth": spec.sensor.bit_depth,
+        "gamma": spec.sensor.gamma,
+        "records": [record],
+        "labels": labels,
+        "parameters": {
+            "eye_model": scene.eye_name,
+            "pupil_diameter_mm": scene.stop_diameter_mm(record["eye"]),
+            "wavelength_nm": spec.wavelength_nm,
+            "spp": spec.image.spp,
+            "seed": spec.seed,
+            "camera": record["camera"],
+            **dict.fromkeys(DRAWN_KEYS),
+            **(drawn or {}),
+            **dict.fromkeys(("spectacles", "contact_lens")),
+            **scene.person_numbers(record["eye"]),
+        },
+    }
