@@ -196,12 +196,16 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
 
     scene, index = frames.scene, frames.index
     camera, head = int(index.camera[row]), int(index.head[row])
-    eye = scene.eye(EYES[index.eye[row]])
     M, t = eye_motion(frames, row)
-    # Each image has its own seed, a pure function of the scene's seed, the frame and the eye.
-    seeds = np.random.SeedSequence([scene.spec.seed, int(index.frame[row]), int(index.eye[row])])
+    # Each image has its own seed, a pure function of the scene's seed, the instant, the eye and the place of the camera
+    # among those that see the eye: other cameras do not change an eye's pictures.
+    side = EYES[index.eye[row]]
+    rank = sum(other.sees(side) for other in scene.rig.cameras[:camera])
+    seeds = np.random.SeedSequence(
+        [scene.spec.seed, int(index.instant[row]), int(index.eye[row]), *([rank] if rank else [])]
+    )
     return RenderJob(
-        eye=eye,
+        eye=scene.eye(side),
         M=M,
         t=t,
         camera=scene.rig.cameras[camera],
@@ -209,7 +213,7 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         lights=tuple(scene.rig.lights[k] for k in scene.rig.lights_of(int(index.eye[row]))),
         sensor=scene.spec.sensor,
         look=scene.spec.look,
-        region=None if scene.region is None else scene.region.of_side(EYES[index.eye[row]]),
+        region=None if scene.region is None else scene.region.of_side(side),
         lens=scene.spec.lens,
         ambient=scene.ambient,
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
