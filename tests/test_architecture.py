@@ -231,21 +231,21 @@ BOUNDS = {
     "apps": 16300,
     "backends": 970,
     "base": 2340,
-    "cli": 2470,
+    "cli": 2530,  # tables of features, targets and gaze from the command line
     "dataset": 9910,
     "design": 2810,
     "extraction": 7250,
     "eye": 3220,
     "folders": 1590,
-    "gaze": 4550,
-    "imaging": 2170,
+    "gaze": 4880,  # calibrations that survive blinks; tables of targets, features and gaze
+    "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,
     "region": 4020,
     "rendering": 12520,
     "report": 970,
-    "rig": 3030,
-    "scene": 2100,
+    "rig": 3070,  # cameras and LEDs that serve one eye: headsets
+    "scene": 2150,  # instants, people and times in records
 }
 
 

@@ -74,16 +74,19 @@ def test_each_subject_is_calibrated_alone():
     assert "3 subjects, each calibrated alone" in result.to_text()
 
 
+def _of_sample(seen, k):
+    """Number frames and instants as in a dataset."""
+    index = replace(seen.index, frame=2 * k + seen.index.camera, instant=np.full(len(seen), k))
+    return replace(seen, index=index)
+
+
 def test_two_cameras_of_one_instant_pair_in_a_drawn_dataset():
     spec = mapping(subjects=3)
     first = spec["scene"]["rig"]["cameras"][0]
     spec["scene"]["rig"]["cameras"].append({**first, "position_mm": [615.0, 150.0, -150.5]})
     made = Plan.of(DatasetSpec.from_mapping(spec))
     samples = [realise(made, k) for k in range(24)]  # three subjects, eight targets each
-    seen = [
-        replace(one.observations, index=replace(one.observations.index, frame=2 * k + one.observations.index.camera))
-        for k, one in enumerate(samples)
-    ]
+    seen = [_of_sample(one.observations, k) for k, one in enumerate(samples)]
     subjects = np.repeat([made.subject_of(k)[0] for k in range(24)], 2)
     truth = concatenate(seen)
     result = er.compare(truth, truth, samples[0].scene.rig, er.gaze.ShihWuLiu(), subjects=subjects)

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, Union, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args
 
 import numpy as np
 import yaml
@@ -49,6 +49,8 @@ def _not_tiny(value: float) -> float:
     return value
 
 
+Side = Literal["right", "left"]
+EYES: tuple[Side, Side] = ("right", "left")
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Vec2 = tuple[Number, Number]
 Vec3 = tuple[Number, Number, Number]

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
+from ..base.errors import InputWarning
 from .app import app
 from .options import EstimatorFlags, EstimatorName, OutputFile, Result, Strict
 from .output import Heed, emit
@@ -18,6 +19,9 @@ PLACES = {
     "glints": "estimated from the glints, with an average cornea",
 }
 """Words for the source of the eye's position, by its code."""
+
+MOST_SHOWN = 50
+"""Most targets, and most records that were left out, that are printed."""
 
 gaze = App(name="gaze", help="Estimate gaze from records of features, also from real images.")
 app.command(gaze)
@@ -38,6 +42,7 @@ def fit(
     scene: str | None = None,
     rig: str | None = None,
     columns: Path | None = None,
+    targets: Path | None = None,
     options: Annotated[EstimatorFlags, Parameter(name="*")] = EstimatorFlags(),
     strict: Strict = False,
     json: Result = None,
@@ -46,21 +51,25 @@ def fit(
 
     Args:
         records: Records as `features` or `extract` write them (JSON), one record per line (JSONL), or a table (CSV).
-            Each needs its target.
+            Each needs its target, or `--targets`.
         output: The calibration file to write.
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file with the meaning of a table's columns (default: recognised from their names).
+        targets: A table of targets by frame, or by the time from which each is shown.
     """
     from ..gaze.records import load_observations
     from ..gaze.store import fit_estimator, save_estimator
+    from ..gaze.table import with_targets
 
-    chosen, targets = options.choose(estimator), options.fixation_list()
+    chosen, fixations = options.choose(estimator), options.fixation_list()
     heed = Heed(strict)
     observations, built = load_observations(
         records, None if scene is None else heed.scene(scene), rig=rig, columns=columns
     )
-    fitted, summary = fit_estimator(chosen, observations, built, targets, source=str(records), warn=heed)
+    if targets is not None:
+        observations = with_targets(observations, targets, columns, built)
+    fitted, summary = fit_estimator(chosen, observations, built, fixations, source=str(records), warn=heed)
     save_estimator(output, fitted, built)
     summary = {**summary, "path": str(output)}
     text = f"{estimator}: calibrated on {summary['calibration_observations']} observations, written to {output}"
@@ -68,8 +77,24 @@ def fit(
         error = summary[f"calibration_error_{unit}"]
         if error["n"]:
             text += f"\nerror on them (not a test): mean {error[f'mean_{unit}']:.4f} {unit} over {error['n']}"
+    text += _targets_table(summary["targets"])
+    for one in summary["left_out"][:MOST_SHOWN]:
+        text += f"\nleft out: frame {one['frame']}, {one['eye']} eye: {one['reason']}"
+    if len(summary["left_out"]) > MOST_SHOWN:
+        text += f"\nleft out: {len(summary['left_out']) - MOST_SHOWN} more records"
     emit(summary, text, json, heed)
     return 0
+
+
+def _targets_table(targets: list[dict[str, Any]]) -> str:
+    """Format the mean residual at each target."""
+    lines = [f"\n{'eye':<8} {'target mm':>26} {'records':>8} {'residual deg':>13}"]
+    for one in targets[:MOST_SHOWN]:
+        place = ", ".join(f"{v:.4g}" for v in one["target_mm"])
+        lines.append(f"{one['eye']:<8} {place:>26} {one['records']:>8} {_cell(one['mean_deg'], '.3f'):>13}")
+    if len(targets) > MOST_SHOWN:
+        lines.append(f"{len(targets) - MOST_SHOWN} more targets: --json")
+    return "\n".join(lines)
 
 
 @gaze.command(name="predict")
@@ -82,6 +107,7 @@ def predict(
     scene: str | None = None,
     rig: str | None = None,
     columns: Path | None = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     screen_px: Annotated[tuple[float, float] | None, Parameter(validator=_positive)] = None,
     strict: Strict = False,
     json: Result = None,
@@ -99,9 +125,14 @@ def predict(
         scene: A scene file or the name of a shipped one, for its rig (default: the rig in the records' file).
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file that says what the columns of a table are (default: as their names say).
+        output: A table (CSV) of the gaze: time_s, frame, eye, x_px, y_px, x_deg, y_deg, valid.
+        screen_px: Width and height of the screen in px, for errors and gaze in px.
     """
+    from ..base.storage.files import refuse_special, write_text
+    from ..gaze.builtin import BuiltIn
     from ..gaze.columns import CsvColumns
-    from ..gaze.predictions import predictions
+    from ..gaze.predictions import gaze_csv, predictions, refuse_nothing
+    from ..gaze.rays import eye_name
     from ..gaze.records import load_observations
     from ..gaze.store import load_calibration
     from ..rig.plausibility import rig_warnings
@@ -115,7 +146,16 @@ def predict(
         heed(rig_warnings(built, calibrated, scene or rig or str(records)))
     if screen_px is None and columns is not None:
         screen_px = CsvColumns.load(columns).screen_px
+    if output is not None:
+        refuse_special(output)
+        if screen_px is None and built.screen is not None:
+            reason = "the screen's size in px is not known, so x_px and y_px are empty; give --screen-px WIDTH HEIGHT"
+            heed([InputWarning(code="screen-px", reason=reason, source=str(output))])
     data = predictions(fitted, observations, built, screen_px)
+    known = [eye_name(eye) for eye in fitted.eyes()] if isinstance(fitted, BuiltIn) else []
+    refuse_nothing(data, known, source=str(records))
+    if output is not None:
+        write_text(output, gaze_csv(data, built, screen_px))
     emit(data, _gaze_table(data), json, heed)
     return 0
 

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json as json_module
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
 
-from ..base.errors import InputError
+from ..base.errors import InputError, InputWarning
 from ..base.processes import usable_cpus
 from ..base.status import Status
 from ..scene.observation import EYES, MAX_BOUNDARY_POINTS, Observations
 from .app import app
 from .options import AtLeastOne, EyeModel, Result, SceneName, Strict
 from .output import Heed, emit, progress
+
+if TYPE_CHECKING:
+    from ..extraction.settings import ExtractionSettings
 
 
 @app.command(name="features")
@@ -66,9 +70,12 @@ def features(
 def extract(
     *images: Path,
     scene: str | None = None,
-    gamma: float = 1.0,
+    gamma: float | None = None,
     method: Literal["fast", "refined"] = "refined",
     eyes: int = 1,
+    polarity: Literal["auto", "dark", "bright"] = "auto",
+    radius_px: tuple[float, float] | None = None,
+    min_confidence: float | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     overlay: Path | None = None,
     processes: AtLeastOne = None,
@@ -83,34 +90,35 @@ def extract(
     Args:
         images: Greyscale images, one folder of images, or one video.
         scene: A scene with the rig; glints are assigned to its lights and listed in their order.
-        gamma: Encoding gamma of the pixel values; 1 is linear.
+        gamma: Encoding gamma of the pixel values (default: 1, linear; 8-bit videos are mostly encoded with 2.2).
         method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit.
         eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
-        output: File for the records, one per line (JSON lines).
+        polarity: Whether the pupil is darker or brighter than the iris.
+        radius_px: Smallest and largest semi-axis of the pupil.
+        min_confidence: Least probability that a pupil is right; others are missing.
+        output: File for the records, one per line (JSON lines), or a table (.csv).
         overlay: Draw the results over the images: a folder for images (PNG), or a file for a video (.mp4, .avi or
             .mkv).
         processes: Number of images processed at the same time (default: one per processor).
     """
-    from ..base.storage.files import make_folder, refuse_special, written
-    from ..extraction.settings import ExtractionSettings
+    from ..base.storage.files import make_folder, refuse_special, write_text
     from ..extraction.video import is_video
-    from ..imaging.imageobserver import ImageObserver, files_of
+    from ..gaze.records import is_table
+    from ..gaze.table import features_csv
+    from ..imaging.imageobserver import ImageObserver, files_of, lights_of
     from ..imaging.videoobserver import VideoOutput, observe_video
 
-    if not images:
-        raise InputError("give at least one image", source="extract")
-    if not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
-        raise InputError("must be between 0.1 and 10", source="--gamma")
-    if eyes not in (1, 2):
-        raise InputError("must be 1 or 2", source="--eyes")
+    _check_extract(images, gamma, eyes)
     heed = Heed(strict)
     loaded = None if scene is None else heed.scene(scene)
-    observer = ImageObserver(gamma=gamma, settings=ExtractionSettings(method=method))
+    settings = _settings(radius_px, min_confidence, method=method, polarity=polarity)
+    observer = ImageObserver(gamma=1.0 if gamma is None else gamma, settings=settings)
     if output is not None:
         refuse_special(output)
     if is_video(images[0]):
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))
+        heed(_gamma_warnings(gamma, images[0]))
         with progress("extracting") as steps:
             files = VideoOutput(output, overlay)
             result = observe_video(images[0], observer, files, scene=loaded, eyes=eyes, progress=steps, warn=heed)
@@ -125,8 +133,9 @@ def extract(
         )  # fmt: skip
     records = list(observed.records())
     if output is not None:
-        with written(output, sync=False) as file:
-            file.writelines(json_module.dumps(one, allow_nan=False).encode() + b"\n" for one in records)
+        lines = (json_module.dumps(one, allow_nan=False) + "\n" for one in records)
+        table = is_table(output)
+        write_text(output, features_csv(observed, lights_of(loaded)) if table else "".join(lines), sync=False)
     data = {"schema": "eyerender/features/1", "rig": None, "records": records}
     names = None
     if observed.index.camera.max() < 0:  # another program rendered the folder
@@ -134,6 +143,34 @@ def extract(
         names = [str(paths[frame]) for frame in observed.index.frame]
     emit(data, _feature_table(observed, names), json, heed)
     return 0
+
+
+def _settings(radius_px: tuple[float, float] | None, min_confidence: float | None, **given: str) -> ExtractionSettings:
+    """Return the settings of an extractor from the options of the command."""
+    from ..extraction.settings import ExtractionSettings
+
+    low, high = radius_px or (None, None)
+    numbers = {"radius_min_px": low, "radius_max_px": high, "min_confidence": min_confidence}
+    options = {"radius_min_px": "--radius-px", "radius_max_px": "--radius-px", "min_confidence": "--min-confidence"}
+    try:
+        return ExtractionSettings.from_mapping(given | {k: v for k, v in numbers.items() if v is not None})
+    except InputError as error:
+        raise InputError(error.reason, source=options.get(error.path, "--radius-px")) from None
+
+
+def _check_extract(images: Sequence[Path], gamma: float | None, eyes: int) -> None:
+    if not images:
+        raise InputError("give at least one image", source="extract")
+    if gamma is not None and not (np.isfinite(gamma) and 0.1 <= gamma <= 10):
+        raise InputError("must be between 0.1 and 10", source="--gamma")
+    if eyes not in (1, 2):
+        raise InputError("must be 1 or 2", source="--eyes")
+
+
+def _gamma_warnings(gamma: float | None, video: Path) -> list[InputWarning]:
+    """Warn of a video whose encoding nobody has stated."""
+    reason = "has 8 bits, taken as linear; give --gamma 2.2 if the camera or its codec encodes them (most do)"
+    return [] if gamma is not None else [InputWarning(code="gamma", reason=reason, source=str(video))]
 
 
 @app.command(name="compare")

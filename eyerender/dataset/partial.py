@@ -209,7 +209,7 @@ class PartialShard:
             lines = list(self._intact_lines(done))
             wanted = set(self.plan.spec.shard_samples(self.shard))
             kept = [(line, raw) for line, raw in lines if line["sample"] in wanted]
-            names = {str(line[key]) for line, _ in kept for key in KINDS.values() if key in line}
+            names = {str(line[key]) for line, _ in kept for key in KINDS.values() if line[key] is not None}
             self._files = {name: done["files"][name] for name in names}
         except (InputError, KeyError, TypeError, ValueError, OSError):
             kept, done = [], {"rejections": [], "given_up": [], "saturated": [], "seconds": 0.0}

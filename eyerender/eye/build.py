@@ -13,12 +13,13 @@ import numpy as np
 
 from ..base.arrays import FloatLike, frozen
 from ..base.errors import InputError
+from ..base.spec import Side
 from ..optics.gradient import GradientMedium
 from ..optics.shells import passing_shells
 from ..optics.surfaces import Surface
 from .landmarks import chief_ray_in_air, fovea_by_nodal_ray, incident_node
 from .model import EyeModel, LineOfSight, RotationCentres, Stop
-from .parts import EyeParts, GradientLensSpec, Side, SurfaceLensSpec
+from .parts import EyeParts, GradientLensSpec, SurfaceLensSpec
 from .surfaces import gradient_lens, index_at, sclera_of, stop_of, surface_of
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..base.arrays import ArrayValue, Bools, FloatLike, Floats, frozen
+from ..base.spec import Side
 from ..optics.gradient import GradientMedium
 from ..optics.shells import SHELLS, even_layers, lens_shells, passing_shells
 from ..optics.surfaces import Surface, Xyz, components, fit, shift, turn_back
 from ..optics.transforms import flip_y, mirror_rotation
-from .parts import Side
 
 __all__ = ["EyeModel", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 

@@ -25,7 +25,6 @@ LARGEST_INDEX = 5.0
 # Cauchy's coefficients grow with the sixth power of nanometres.
 Coefficient = Annotated[float, Field(ge=-1e20, le=1e20)]
 
-Side = Literal["right", "left"]
 Facing = Literal["front", "back"]
 
 

@@ -8,11 +8,11 @@ from typing import Any, Self
 from pydantic import model_validator
 
 from ..base.errors import InputError
-from ..base.spec import KeyProblem
+from ..base.spec import KeyProblem, Side
 from .build import build_eye
 from .check import check_eye
 from .model import EyeModel
-from .parts import EyeParts, Side
+from .parts import EyeParts
 from .topography import with_topographies
 
 

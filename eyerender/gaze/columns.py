@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ..base.errors import Problems
-from ..base.spec import FileSpec, Positive, Spec, Vec2, Vec3
+from ..base.spec import FileSpec, Positive, Side, Spec, Vec2, Vec3
 from ..base.storage.files import shown
 from ..rig.light import MAX_LIGHTS
 from ..scene.observation import EYES
@@ -204,7 +204,7 @@ def _found(header: list[str], problems: Problems) -> dict[str, Any]:
         whole.add(bare, column)
         split = _SIDES.match(_UNIT.sub("", bare)) or _SIDES.match(bare)
         if split:
-            side = "right" if (split[1] or split[4]).startswith("r") else "left"
+            side: Side = "right" if (split[1] or split[4]).startswith("r") else "left"
             sides[side].add(split[2] or split[3], column)
     found = whole.eye()
     for key, names in _PLAIN_NAMES.items():

@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 
 from ..base.arrays import Floats, Objects
+from ..base.errors import InputError
 from ..optics.transforms import direction_of
 from ..rig.rig import RigLike
 from ..scene.observation import Observations
@@ -84,6 +85,10 @@ class DirectionRegression(PolynomialEstimator):
         features, reason = self.features(observations, rig)
         wanted = angles_of(np.asarray(direction, dtype=float))
         usable = is_none(reason) & np.isfinite(wanted).all(axis=1)
+        if not usable.any() and np.isnan(observations.index.eye_position_mm).any(axis=1).all():
+            raise InputError(
+                "needs the places of the eyes: eye_position_x, _y, _z (mm), or eye_position_mm in --columns"
+            )
         fits = {
             eye: self._polynomial.fit_eye(features[rows], wanted[rows], name)
             for eye, name, rows in eyes_of(observations, usable)

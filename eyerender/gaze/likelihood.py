@@ -22,7 +22,7 @@ from ..rig.rig import RigLike
 from ..scene.observation import EYES, Observations
 from .builtin import BuiltIn
 from .estimate import GazePoints, GazeRays
-from .rays import is_none, screen_of
+from .rays import NOT_CALIBRATED, is_none, screen_of
 
 if TYPE_CHECKING:
     from ..design.fit import EyeFit
@@ -87,7 +87,7 @@ class MaximumLikelihood(BuiltIn):
             raise InputError("the estimator is not calibrated; call fit first")
         n = len(observations)
         reason = np.full(n, None, dtype=object)
-        reason[~np.isin(observations.index.eye, list(self.persons))] = "this eye is not calibrated"
+        reason[~np.isin(observations.index.eye, list(self.persons))] = NOT_CALIBRATED
         reason[is_none(reason) & ~observations.pupil.ok] = "no pupil"
         usable = np.flatnonzero(is_none(reason))
         origin, direction = np.full((n, 3), np.nan), np.full((n, 3), np.nan)

@@ -8,6 +8,9 @@ at 600 mm by 1 %.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,13 +18,14 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Objects, finite_or_none
 from ..base.errors import InputError
 from ..base.status import Status
+from ..base.storage.files import csv_text
 from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
 from ..scene.observation import EYES, Observations
 from .cornea import from_all_glints
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .parameters import MEAN_EYE
-from .rays import feature_rays, is_none, targets_on_screen
+from .rays import NOT_CALIBRATED, feature_rays, is_none, targets_on_screen
 
 POINTS_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/3", "eyerender/gaze/4"
 """Schemas of gaze points on a screen, and of gaze rays of a rig without one."""
@@ -66,6 +70,9 @@ def predictions(
         for i in range(len(observations))
     ]
     summary = _by_eye(observations, gaze.ok, errors, source)
+    angles = _screen_angles(gaze.point_mm, place, rig.screen)
+    for entry, angle in zip(single, angles, strict=True):
+        entry["angle_deg"] = _numbers(angle)
     binocular: list[dict[str, Any]] = []
     if len(np.unique(index.eye[index.eye >= 0])) == 2:
         frames, both = binocular_average(observations, gaze)
@@ -73,6 +80,7 @@ def predictions(
             middle = _middles(observations, place, frames)
             errors = {"deg": angular_error_deg(both.point_mm, frames.index.target_mm, middle)}
             errors |= _screen_errors(frames, both.point_mm, rig.screen, screen_px)
+            angles = _screen_angles(both.point_mm, middle, rig.screen)
         binocular = [
             {
                 "frame": int(frames.index.frame[i]),
@@ -80,6 +88,8 @@ def predictions(
                 "reason": both.reason[i],
                 "point_mm": both.point_mm[i].tolist() if both.ok[i] else None,
                 **_errors_of(errors, i),
+                "time_s": finite_or_none(frames.index.time_s[i]),
+                "angle_deg": _numbers(angles[i]),
             }
             for i in range(len(both))
         ]
@@ -149,6 +159,69 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
     return place, source
 
 
+def _screen_angles(point_mm: Floats, eye_mm: Floats, screen: ScreenPlane | None) -> Floats:
+    """Compute visual angles (n, 2) deg of gaze points to the right of the screen's centre and above it.
+
+    They are arctan(offset on the screen / distance of the eye from its plane); NaN without a screen or an eye's place.
+    """
+    if screen is None:
+        return np.full((len(point_mm), 2), np.nan)
+    distance = (eye_mm - screen.centre_mm) @ screen.normal
+    return np.asarray(np.degrees(np.arctan2(screen.flat(point_mm), distance[:, None])))
+
+
+def refuse_nothing(data: dict[str, Any], calibrated: Sequence[str], *, source: str) -> None:
+    """Raise an error if `predictions` estimated nothing: with the reason of most records.
+
+    Args:
+        data: the result of `predictions`.
+        calibrated: eyes that the calibration knows.
+        source: name of the records in the message.
+
+    Raises:
+        InputError: no record has an estimate.
+    """
+    entries = data["gaze"]
+    if any(entry["status"] == "ok" for entry in entries):
+        return
+    named = sorted({entry["eye"] for entry in entries if entry["eye"] is not None})
+    reason, count = Counter(str(entry["reason"]) for entry in entries).most_common(1)[0]
+    if reason == NOT_CALIBRATED:
+        knows, name = (" and ".join(eyes) or "no" for eyes in (calibrated, named))
+        reason = f"the calibration knows the {knows} eye; the records name {f'the {name} eye' if named else 'none'}"
+        raise InputError(f"no gaze was estimated: {reason}", source=source)
+    raise InputError(f"no gaze was estimated: {reason} ({count} of {len(entries)} records)", source=source)
+
+
+def gaze_csv(data: dict[str, Any], rig: RigGeometry, screen_px: tuple[float, float] | None = None) -> str:
+    """Format the result of `predictions` as a table, one row for each eye and one for both at each moment.
+
+    Columns: `time_s`, `frame`, `eye`, `x_px` and `y_px` from the screen's top left (empty without `screen_px`), `x_deg`
+    and `y_deg` to the right of the screen's centre and above it, `valid`. Without a screen, `azimuth_deg` and
+    `elevation_deg` of the ray stand in place of x and y.
+    """
+    screen = rig.screen
+    names = ("x_px", "y_px", "x_deg", "y_deg") if screen is not None else ("azimuth_deg", "elevation_deg")
+    rows = []
+    for entry in [*data["gaze"], *({**both, "eye": "both"} for both in data["binocular"])]:
+        if screen is None:
+            values: list[float | None] = [None, None]
+            if entry["direction"] is not None:
+                x, y, z = entry["direction"]
+                values = [math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))]
+        else:
+            pixels: list[float | None] = [None, None]
+            if entry["point_mm"] is not None and screen_px is not None:
+                across, up = screen.flat(entry["point_mm"])
+                width, height = screen.size_mm
+                pixels = [screen_px[0] * (across / width + 0.5), screen_px[1] * (0.5 - up / height)]
+            values = [*pixels, *(entry["angle_deg"] or (None, None))]
+        cells = ["" if value is None else f"{value:.6g}" for value in values]
+        time_s = "" if entry["time_s"] is None else f"{entry['time_s']:.9g}"
+        rows.append([time_s, entry["frame"], entry["eye"] or "", *cells, int(entry["status"] == "ok")])
+    return csv_text(["time_s", "frame", "eye", *names, "valid"], sorted(rows, key=lambda row: row[1]))
+
+
 def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
     """Compute centres of corneal curvature (n, 3) mm from the glints and an average radius; NaN where this fails."""
     centre = np.full((len(observations), 3), np.nan)
@@ -214,6 +287,7 @@ def _identity(observations: Observations, i: int) -> dict[str, Any]:
     index = observations.index
     return {
         "frame": int(index.frame[i]),
+        "time_s": finite_or_none(index.time_s[i]),
         "fixation": int(index.fixation[i]) if index.fixation[i] >= 0 else None,
         "camera": int(index.camera[i]) if index.camera[i] >= 0 else None,
         "eye": EYES[int(index.eye[i])] if index.eye[i] >= 0 else None,

@@ -18,6 +18,8 @@ from ..rig.screen import ScreenPlane
 from ..scene.observation import EYES, Observations
 
 T = TypeVar("T")
+NOT_CALIBRATED = "this eye is not calibrated"
+"""Reason of observations of an eye that the calibration does not know."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -198,7 +200,7 @@ def calibrated_eyes(
         if eye in calibrations:
             yield rows, calibrations[eye]
         else:
-            reason[rows] = "this eye is not calibrated"
+            reason[rows] = NOT_CALIBRATED
 
 
 def is_none(reason: Objects) -> Bools:

@@ -27,6 +27,12 @@ from .table import observations_from_csv
 TABLES = (".csv", ".tsv")
 """Suffixes of files that are read as tables."""
 
+
+def is_table(path: str | Path) -> bool:
+    """Return whether a file of this name is a table."""
+    return Path(path).suffix.lower() in TABLES
+
+
 # About 40,000 observations. All of them are held in memory at once.
 MAX_RECORDS_BYTES = 128 * 2**20
 
@@ -60,7 +66,7 @@ def load_observations(
         given = (scene if isinstance(scene, Scene) else load_scene(scene)).rig
     elif rig is not None:
         given = load_rig(rig) if isinstance(rig, str | Path) else rig.build()
-    if columns is not None or Path(path).suffix.lower() in TABLES:
+    if columns is not None or is_table(path):
         if given is None:
             raise InputError("holds no rig; give --rig or --scene", source=source)
         return observations_from_csv(path, columns, given), given

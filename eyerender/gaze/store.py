@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import InputError, Warn
+from ..base.errors import InputError, InputWarning, Warn
 from ..base.references import is_reference
 from ..base.storage.files import read_json, shown, write_json
 from ..rig.plausibility import target_warnings
@@ -20,10 +20,14 @@ from .estimate import GazeEstimator
 from .estimators import ESTIMATORS, estimator_class, name_of
 from .own import OwnEstimator
 from .predictions import predictions
+from .rays import eye_name, is_none
 from .records import rig_from_mapping
+from .screening import wrong_rows
 
 CALIBRATION_SCHEMA = "eyerender/gaze-calibration/4"
-FIT_SCHEMA = "eyerender/gaze-fit/2"
+FIT_SCHEMA = "eyerender/gaze-fit/3"
+LARGE_MISS_DEG, LARGE_SHARE = 2.0, 0.2
+"""Median residual, and share of records left out, from which a calibration is probably wrong."""
 
 
 def choose_estimator(given: str, *, source: str = "--estimator", **options: Any) -> GazeEstimator:
@@ -48,7 +52,10 @@ def fit_estimator(
     source: str = "",
     warn: Warn | None = None,
 ) -> tuple[GazeEstimator, dict[str, Any]]:
-    """Calibrate an estimator and summarise the result (schema eyerender/gaze-fit/2).
+    """Calibrate an estimator on the records that are right, and summarise the result (schema eyerender/gaze-fit/3).
+
+    Records are left out if the extractor is unsure of their pupil, or if pupil or glints lie far from where those of
+    the other targets put them (`screening.py`).
 
     Args:
         estimator: the estimator, not calibrated.
@@ -56,7 +63,8 @@ def fit_estimator(
         rig: the rig that observed them.
         fixations: fixations for the calibration, counted from 0; None: all.
         source: name of the observations in messages.
-        warn: called for targets off the screen and if the targets do not determine the estimator; it may raise.
+        warn: called for targets off the screen, if the targets do not determine the estimator, and for a calibration
+            that misses its own targets; it may raise.
 
     Raises:
         InputError: there are no targets, a fixation does not exist, or the estimator cannot be calibrated.
@@ -72,25 +80,69 @@ def fit_estimator(
         raise InputError("a calibration needs records with target_mm", source=source)
     if isinstance(estimator, OwnEstimator):
         estimator.check_storable()
-    used = observations.take(rows)
+    given = observations.take(rows)
+    reasons = wrong_rows(given)
+    used = given.take(is_none(reasons))
     if warn is not None:
-        warn(target_warnings(used.index.target_mm, rig.screen, source))
+        warn(target_warnings(given.index.target_mm, rig.screen, source))
     try:
         with np.errstate(all="ignore"), undetermined_to(warn, source):
             fitted = estimator.fit(used, rig)
     except InputError as error:
-        raise error.placed(source=source) from None
+        left = len(given) - len(used)
+        more = f" ({left} of {len(given)} records were left out as wrong)" if left else ""
+        raise InputError(error.reason + more, source=error.source or source, path=error.path) from None
     except np.linalg.LinAlgError:
         raise InputError("the records do not determine a calibration", source=source) from None
     gaze = predictions(fitted, used, rig)
+    stored = _stored(fitted)["estimator"]
+    targets = _by_target(used, gaze["gaze"])
+    if warn is not None:
+        warn(_misfit_warnings(gaze["gaze"], len(used), len(given), source))
     return fitted, {
         "schema": FIT_SCHEMA,
-        "estimator": _stored(fitted)["estimator"],
+        "estimator": stored,
         "calibration_observations": len(used),
         "eye_place": sorted({place for one in gaze["summary"] for place in one["eye_place"]}),
         "calibration_error_deg": _mean_and_max(gaze["gaze"], "deg"),
         "calibration_error_mm": _mean_and_max(gaze["gaze"], "mm"),
+        "targets": targets,
+        "left_out": [
+            {
+                "frame": int(given.index.frame[k]),
+                "camera": int(given.index.camera[k]) if given.index.camera[k] >= 0 else None,
+                "eye": eye_name(int(given.index.eye[k])),
+                "reason": reasons[k],
+            }
+            for k in np.flatnonzero(~is_none(reasons))
+        ],
     }
+
+
+def _by_target(used: Observations, gaze: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the mean residual of each eye at each target: eye, target_mm, records, mean_deg (None if unknown)."""
+    keys = np.column_stack([used.index.eye, np.round(used.index.target_mm, 6)])
+    out = []
+    for key in np.unique(keys, axis=0):
+        rows = np.flatnonzero((keys == key).all(axis=1))
+        errors = [gaze[row]["error_deg"] for row in rows if gaze[row]["error_deg"] is not None]
+        mean = float(np.mean(errors)) if errors else None
+        target = [float(v) for v in key[1:]]
+        out.append({"eye": eye_name(int(key[0])), "target_mm": target, "records": len(rows), "mean_deg": mean})
+    return out
+
+
+def _misfit_warnings(gaze: list[dict[str, Any]], used: int, given: int, source: str) -> list[InputWarning]:
+    """Warn of a calibration that misses its own targets, or that had to leave out many records."""
+    found = []
+    errors = [one["error_deg"] for one in gaze if one["error_deg"] is not None]
+    if errors and (miss := float(np.median(errors))) > LARGE_MISS_DEG:
+        reason = f"the calibration misses its own targets by {miss:.1f} deg (median); look at the records and the rig"
+        found.append(InputWarning(code="misfit", reason=reason, source=source))
+    if given - used > LARGE_SHARE * given:
+        reason = f"{given - used} of {given} records were left out as wrong; look at them with --json"
+        found.append(InputWarning(code="left-out", reason=reason, source=source))
+    return found
 
 
 def _mean_and_max(gaze: list[dict[str, Any]], unit: str) -> dict[str, Any]:

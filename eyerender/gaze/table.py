@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.arrays import Bools, Floats, Ints, Objects, frozen
 from ..base.errors import InputError, Problems
 from ..base.status import Status
-from ..base.storage.files import read_bytes, shown
+from ..base.storage.files import csv_text, read_bytes, shown
 from ..rig.light import MAX_LIGHTS
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
@@ -66,6 +68,13 @@ def observations_from_csv(
     Raises:
         InputError: naming the wrong lines and columns.
     """
+    table, named = _opened(path, columns)
+    screen = None if rig is None else rig.build().screen
+    return _observations(table, named, screen)
+
+
+def _opened(path: str | Path, columns: str | Path | Mapping[str, Any] | CsvColumns | None) -> tuple[_Table, CsvColumns]:
+    """Read a table, and complete the meaning of its columns by their names."""
     if columns is None:
         given = CsvColumns()
     elif isinstance(columns, CsvColumns):
@@ -74,9 +83,7 @@ def observations_from_csv(
         given = CsvColumns.load(columns) if isinstance(columns, str | Path) else CsvColumns.from_mapping(columns)
     told = str(columns) if isinstance(columns, str | Path) else "columns"
     table = _Table.read(path, given.delimiter)
-    named = completed(given, table.header, told, table.problems)
-    screen = None if rig is None else rig.build().screen
-    return _observations(table, named, screen)
+    return table, completed(given, table.header, told, table.problems)
 
 
 @dataclass
@@ -193,6 +200,7 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
     width = max(len(part.glints or ()) for part, _ in parts)
     if len(line) * width > MAX_GLINTS:
         raise InputError(f"holds more than {MAX_GLINTS} glints", source=table.source)
+    times = _times(table, columns)[line]
     features = [_features(table, part, columns, width) for part, _ in parts]
     values = {key: np.concatenate([part[key] for part in features]) for key in features[0]}
     values["target"] = _targets(table, columns, screen)[line]
@@ -226,6 +234,7 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
             camera=rows[:, 1],
             head=np.zeros(len(rows), np.int64),
             eye=rows[:, 2],
+            time_s=times[first],
             target_mm=found["target"],
             head_mm=head,
             eye_position_mm=position,
@@ -308,7 +317,10 @@ def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) 
         "pupil": table.several(part.pupil, 2) + columns.offset_px,
         "shape": shape,
         "glints": glints,
-        "confidence": table.numbers(part.confidence if columns.min_confidence is not None else None),
+        # Rows of single glints may each repeat a confidence of their own.
+        "confidence": table.numbers(
+            part.confidence if columns.light is None or columns.min_confidence is not None else None
+        ),
         "position": table.several(part.eye_position, 3),
     }
 
@@ -419,4 +431,106 @@ def _pupil(found: dict[str, Floats], columns: CsvColumns) -> PupilFeatures:
         centre_px=np.where(ok[:, None], centre, np.nan),
         semi_axes_px=np.where(ok[:, None], shape[:, :2], np.nan),
         angle_rad=np.where(ok, shape[:, 2] % np.pi, np.nan),
+        confidence=found["confidence"],
     )
+
+
+def _times(table: _Table, columns: CsvColumns) -> Floats:
+    """Return the time of each row (n,); NaN where the column holds something else than numbers."""
+    out = np.full(len(table), np.nan)
+    for k, cell in enumerate(table.cells[columns.time] if columns.time else ()):
+        with suppress(ValueError):
+            value = float(cell.strip().replace(",", ".") if table.decimal_comma else cell)
+            out[k] = value if abs(value) <= _LARGEST else np.nan
+    return out
+
+
+def read_targets(
+    path: str | Path, columns: str | Path | Mapping[str, Any] | CsvColumns | None, rig: RigLike
+) -> tuple[str, Floats, Floats]:
+    """Read a table of targets.
+
+    Returns:
+        "frame" or "time", the frames or times (n,), and the targets (n, 3) mm, NaN where a row names none.
+
+    Raises:
+        InputError: naming the wrong lines and columns.
+    """
+    table, named = _opened(path, columns)
+    if named.target is None:
+        raise InputError("has no target (target_x, target_y, target_z in mm; or target_x_mm, ...)", source=table.source)
+    kind = "frame" if named.frame is not None else "time"
+    key = named.frame or named.time
+    if key is None:
+        raise InputError("needs a column frame or time", source=table.source)
+    keys, target = table.numbers(key), _targets(table, named, rig.build().screen)
+    for k in np.flatnonzero(np.isnan(keys)).tolist():
+        table.refuse(k, key, "is empty")
+    table.problems.check()
+    return kind, keys, target
+
+
+def with_targets(
+    observations: Observations,
+    path: str | Path,
+    columns: str | Path | Mapping[str, Any] | CsvColumns | None,
+    rig: RigLike,
+) -> Observations:
+    """Give observations the targets of a table.
+
+    A row of the table with a `frame` belongs to this frame. A row with a `time` holds until that of the next row; a row
+    without a target ends the one before. Equal targets are one fixation.
+
+    Raises:
+        InputError: the table is wrong, the observations have no times, or no row fits.
+    """
+    kind, keys, target = read_targets(path, columns, rig)
+    order = np.argsort(keys, kind="stable")
+    keys, target = keys[order], target[order]
+    mine = observations.index.frame.astype(float) if kind == "frame" else observations.index.time_s
+    if np.isnan(mine).all():
+        raise InputError("holds times, but the observations have none; give frames", source=str(path))
+    # A time that is rounded up still belongs to its frame.
+    steps = np.diff(np.unique(mine[np.isfinite(mine)]))
+    slack = 0.0 if kind == "frame" or not len(steps) else float(np.median(steps)) / 2
+    at = np.searchsorted(keys, mine + slack, side="right") - 1
+    fits = (at >= 0) & np.isfinite(mine) & ((kind == "time") | (keys[np.maximum(at, 0)] == mine))
+    found = np.where(fits[:, None], target[np.maximum(at, 0)], np.nan)
+    there = np.isfinite(found).all(axis=1)
+    if not there.any():
+        raise InputError(f"no {kind} of it is one of the observations'", source=str(path))
+    fixation = np.full(len(mine), -1, np.int64)
+    fixation[there] = count_heads(found[there])
+    index = replace(observations.index, fixation=fixation, target_mm=frozen(found))
+    return replace(observations, index=index)
+
+
+def features_csv(observations: Observations, lights: int | None) -> str:
+    """Format observations as a table that `observations_from_csv` reads (docs/own_data.md).
+
+    Args:
+        observations: the observations.
+        lights: number of lights of the rig; None: glints of unknown lights are written as `spot0_x`, ..., which are not
+            read as glints of lights.
+    """
+    index, pupil, glints = observations.index, observations.pupil, observations.glints
+    several = bool((index.camera > 0).any())
+    count = glints.status.shape[1] if lights is None else lights
+    name = "spot" if lights is None else "glint"
+    header = ["frame", "time", *(["camera"] if several else []), "eye", "pupil_x", "pupil_y", "pupil_semi_axis_a"]
+    header += ["pupil_semi_axis_b", "pupil_angle_rad", "confidence"]
+    header += [f"{name}{k}_{axis}" for k in range(count) for axis in "xy"]
+    if lights is None:
+        places = np.where(glints.ok[..., None], glints.xy_px, np.nan)
+    else:
+        places = np.stack([glints.of_light(k)[0] for k in range(lights)], axis=1).reshape(len(index), -1, 2)
+    numbers = np.column_stack(
+        [pupil.centre_px, pupil.semi_axes_px, pupil.angle_rad, pupil.confidence, places.reshape(len(index), -1)]
+    )
+    rows = []
+    for k, row in enumerate(numbers.tolist()):
+        time = index.time_s[k].item()
+        who = ["" if math.isnan(time) else time, *([int(index.camera[k])] if several else [])]
+        side = EYES[index.eye[k]] if index.eye[k] >= 0 else ""
+        rows.append([int(index.frame[k]), *who, side, *("" if math.isnan(v) else f"{v:.9g}" for v in row)])
+    return csv_text(header, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -173,7 +174,14 @@ class ImageObserver:
         return concatenate(parts)
 
     def observe_found(
-        self, found: Sequence[Extraction], frame: int, shape: tuple[int, int], *, scene: Scene | None, source: str
+        self,
+        found: Sequence[Extraction],
+        frame: int,
+        shape: tuple[int, int],
+        *,
+        scene: Scene | None,
+        source: str,
+        time_s: float = math.nan,
     ) -> Observations:
         """Convert extractions of a whole sensor image (h, w) to observations: of one eye, or of both halves.
 
@@ -193,7 +201,7 @@ class ImageObserver:
                 sides = [EYES.index(name) for name in scene.spec.subject.eyes if camera.sees(name)]
                 eye = sides[0] if len(found) == len(sides) == 1 else eye
                 lights, reasons = _lights(one, np.zeros(2), scene.rig, camera, np.full(3, np.nan), eye)
-            index = Index(frame=np.array([frame]), eye=np.array([eye]))
+            index = Index(frame=np.array([frame]), eye=np.array([eye]), time_s=np.array([time_s]))
             parts.append(_observation(one, lights, reasons, np.zeros(2), index))
         return concatenate(parts)
 
@@ -280,6 +288,11 @@ def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> Non
             state = picture.stat()
             if (state.st_dev, state.st_ino) in inputs:
                 raise InputError("is one of the images, so it is not written to", source=str(picture))
+
+
+def lights_of(scene: Scene | None) -> int | None:
+    """Return the number of lights by which glints are named; None without a scene."""
+    return None if scene is None else len(scene.rig.lights)
 
 
 def colour_warning(count: int, what: str) -> InputWarning:
@@ -394,7 +407,7 @@ def _observation(
     lights, reasons = [lights[i] for i in order], [reasons[i] for i in order]
     pupil, glints = found.pupil, [found.glints[i] for i in order]
     m = len(glints)
-    known: dict[str, Any] = {"status": [pupil.status], "reason": [pupil.reason]}
+    known: dict[str, Any] = {"status": [pupil.status], "reason": [pupil.reason], "confidence": [pupil.confidence]}
     if pupil.ellipse is not None:
         known["centre_px"] = [pupil.ellipse.centre_px + corner]
         known["semi_axes_px"] = [pupil.ellipse.semi_axes_px]

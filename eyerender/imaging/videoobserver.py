@@ -12,11 +12,13 @@ from typing import Any
 from ..base.errors import Warn
 from ..base.progress import Progress, notify
 from ..base.storage.files import written
-from ..extraction import Extraction
 from ..extraction.overlay import overlay as drawn
 from ..extraction.video import VideoReader, VideoWriter, follow
+from ..gaze.records import is_table
+from ..gaze.table import features_csv
 from ..scene import Scene
-from .imageobserver import ImageObserver, colour_warning
+from ..scene.observation import Observations, concatenate
+from .imageobserver import ImageObserver, colour_warning, lights_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,8 +49,7 @@ class VideoOutput:
     """Files written for an observed video.
 
     Attributes:
-        records: one JSON object per line: the record, the frame's `time_s` (null if unknown) and the pupil's
-            `confidence`.
+        records: one record per line (JSON), or a table (.csv) of `features_csv`.
         overlay: video with the results drawn over the frames (.mp4, .avi or .mkv).
     """
 
@@ -81,6 +82,8 @@ def observe_video(
     count = pupils = ok = coloured = 0
     with ExitStack() as stack:
         file = None if output.records is None else stack.enter_context(written(output.records, sync=False))
+        table = output.records is not None and is_table(output.records)
+        parts: list[Observations] = []
         writer: VideoWriter | None = None
         for frame, found in follow(reader, gamma=observer.gamma, settings=observer.settings, eyes=eyes):
             if output.overlay is not None:
@@ -88,13 +91,19 @@ def observe_video(
                     height, width = frame.image.shape
                     writer = stack.enter_context(VideoWriter(output.overlay, width, height, reader.frames_per_s))
                 writer.add(drawn(frame.image, found, 255.0))
-            seen = observer.observe_found(found, frame.number, frame.image.shape, scene=scene, source=str(path))
-            if file is not None:
-                for line, one in zip(seen.records(), found, strict=True):
-                    file.write(_line(line, frame.time_s, one))
+            time_s = frame.time_s if math.isfinite(frame.time_s) else math.nan
+            seen = observer.observe_found(
+                found, frame.number, frame.image.shape, scene=scene, source=str(path), time_s=time_s
+            )
+            if table:
+                parts.append(seen)
+            elif file is not None:
+                file.writelines(json.dumps(one, allow_nan=False).encode() + b"\n" for one in seen.records())
             count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
             ok += sum(one.pupil.ok for one in found)
             notify(progress, count, max(reader.count, count), "")
+        if file is not None and table:
+            file.write(features_csv(concatenate(parts), lights_of(scene)).encode())
     if coloured and warn is not None:
         warn([colour_warning(coloured, "frames")])
     return VideoSummary(
@@ -104,8 +113,3 @@ def observe_video(
         found=ok,
         records=None if output.records is None else str(output.records),
     )
-
-
-def _line(record: dict[str, Any], time_s: float, found: Extraction) -> bytes:
-    timed = {**record, "time_s": time_s if math.isfinite(time_s) else None, "confidence": found.pupil.confidence}
-    return json.dumps(timed, allow_nan=False).encode() + b"\n"

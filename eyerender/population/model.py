@@ -26,11 +26,9 @@ from numpy.polynomial.hermite_e import hermegauss, hermevander
 
 from ..base.arrays import Floats
 from ..base.errors import InputError
-from ..eye.parts import Side
 from .correlation import completed, nearest_correlation
 from .table import ROOTS, CorrelatedPair, Distribution, PopulationTable, Quantity, QuantityRegression, default_table
 
-SIDES: tuple[Side, Side] = ("right", "left")
 _NODES, _ORDERS = 200, 16  # r^16 is below 1e-11 for the correlations of refraction and age
 
 

@@ -14,9 +14,8 @@ from pydantic import Field, model_validator
 
 from ..base.arrays import Floats
 from ..base.errors import InputError
-from ..base.spec import KeyProblem, Number, Spec
+from ..base.spec import EYES, KeyProblem, Number, Side, Spec
 from ..eye.fixation import far_sight_mm
-from ..eye.parts import Side
 from ..eye.refraction import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..region.anatomy import Region
@@ -24,7 +23,7 @@ from ..region.look import Look
 from .draw import Conditions, latent_numbers
 from .eyes import amplitude_d, eye_file
 from .marginals import Fixed
-from .model import SIDES, Model, default_reference
+from .model import Model, default_reference
 from .pupil import watson_yellott_mm
 from .refraction import Biometry, Optics, solve
 from .table import ROOTS, Distribution, PopulationTable, QuantityRegression, default_table
@@ -117,7 +116,7 @@ class Person(Spec):
         value = self.numbers.get(name)
         if value is None or isinstance(value, tuple) != (side is not None):
             raise InputError("missing, or not of the right kind", path=f"person.numbers.{name}")
-        return value[SIDES.index(side)] if isinstance(value, tuple) and side is not None else float(value)  # type: ignore[arg-type]
+        return value[EYES.index(side)] if isinstance(value, tuple) and side is not None else float(value)  # type: ignore[arg-type]
 
     def to_json(self) -> str:
         """Return the person as text, the same for equal persons."""
@@ -149,7 +148,7 @@ class Person(Spec):
     @property
     def mean_refraction_d(self) -> float:
         """Mean refraction (D) of both eyes at the cornea; hyperopes must accommodate by it to see far away."""
-        return float(np.mean([at_cornea_d(self.number("refraction_d", side)) for side in SIDES]))
+        return float(np.mean([at_cornea_d(self.number("refraction_d", side)) for side in EYES]))
 
     def draw_seed(self, purpose: str) -> int:
         """Return a seed of 31 bits for something without a quantity in the table, such as hairs."""
@@ -201,7 +200,7 @@ class Person(Spec):
         Raises:
             InputError: the eye is physically impossible.
         """
-        k = SIDES.index(side)
+        k = EYES.index(side)
         numbers = {name: value[k] for name, value in self.numbers.items() if isinstance(value, tuple)}
         return eye_file(
             f"{self.preset} {self.seed}/{self.subject}",
@@ -239,7 +238,7 @@ class Person(Spec):
 def _apex_distance_mm(text: str) -> float:
     """Solve for `apex_distance_mm` of a person from its JSON; cached for all frames."""
     person = Person.from_mapping(json.loads(text))
-    eyes = (person.eye(side, demand_d=max(person.mean_refraction_d, 0.0)).build() for side in SIDES)
+    eyes = (person.eye(side, demand_d=max(person.mean_refraction_d, 0.0)).build() for side in EYES)
     # Eye files are written as right eyes, so +y is nasal in both.
     return person.ipd_mm + float(sum(far_sight_mm(eye)[0] for eye in eyes))
 

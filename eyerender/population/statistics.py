@@ -11,7 +11,8 @@ import numpy as np
 from ..base.arrays import Floats, Ints
 from ..base.errors import InputError
 from ..base.progress import Progress, notify
-from .model import SIDES, Model
+from ..base.spec import EYES
+from .model import Model
 from .people import PopulationSpec
 
 CHUNK = 4096
@@ -166,7 +167,7 @@ def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Pro
             values.setdefault(name, []).append(_right(column))
     for subject in range(n):
         person = population.person(subject, seed)
-        for side in SIDES:
+        for side in EYES:
             try:
                 person.eye(side).build()
             except InputError as error:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.errors import InputError
-from ..base.spec import Number, Positive, Spec, Vec2, Vec3
+from ..base.spec import Number, Positive, Side, Spec, Vec2, Vec3
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
@@ -32,8 +32,6 @@ Distortion = tuple[Number, Number, Number, Number, Number]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
 Window = tuple[int, int, int, int]
 """A part of a sensor: its first column and row, its width and its height (px)."""
-Side = Literal["right", "left"]
-SIDES: tuple[Side, Side] = ("right", "left")
 
 
 def _distinct(eyes: tuple[Side, ...]) -> tuple[Side, ...]:

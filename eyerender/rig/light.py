@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Floats, frozen
-from ..base.spec import NonNegative, Number, Positive, Spec, Vec3
-from .camera import SIDES, EyeNames, PinholeCamera, Side
+from ..base.spec import EYES, NonNegative, Number, Positive, Side, Spec, Vec3
+from .camera import EyeNames, PinholeCamera
 
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
 # frame.
@@ -154,7 +154,7 @@ class Lamp(ArrayValue):
 
     def lights(self, eye: int) -> bool:
         """Return whether the LED lights an eye: 0 right, 1 left, -1 unknown (then yes)."""
-        return self.eyes is None or eye < 0 or SIDES[eye] in self.eyes
+        return self.eyes is None or eye < 0 or EYES[eye] in self.eyes
 
     def towards(self, point_mm: Floats) -> tuple[float, float, float]:
         """Compute the radiant intensity I cos^m (mW/sr) towards a point (3,), this cosine, and the distance (mm)."""

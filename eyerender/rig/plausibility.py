@@ -121,7 +121,8 @@ def place_warnings(
         if code is not None and reason is not None:
             found.setdefault(path, InputWarning(code=code, reason=reason, path=path))
     for path, lamp in zip(light_paths, rig.lights, strict=True):
-        if (reason := _unaimed(lamp, eyes_mm)) is not None:
+        lit = _served(eyes_mm, lamp.eyes)
+        if lit and (reason := _unaimed(lamp, lit)) is not None:
             found.setdefault(path, InputWarning(code="aim", reason=reason, path=path))
     if rig.screen is not None and np.linalg.norm(rig.screen.centre_mm) < _LEAST_DISTANCE_MM:
         path = "rig.screen.centre_mm"
@@ -144,7 +145,9 @@ def mirror_warnings(cameras: Sequence[Camera], eyes_mm: Mapping[str, Floats]) ->
             continue
         normal, offset = camera.mirror.plane
         own = float(normal @ camera.unmirrored().nodal_point_mm) - offset
-        hidden = [name for name, eye in eyes_mm.items() if (float(normal @ eye) - offset) * own < 0]
+        hidden = [
+            name for name, eye in _served(eyes_mm, camera.eyes).items() if (float(normal @ eye) - offset) * own < 0
+        ]
         if hidden:
             reason = f"stands between the camera and {hidden[0]}, so the camera cannot see it in the mirror"
             found.append(InputWarning(code="mirror", reason=reason, path=f"rig.cameras.{k}.mirror"))
@@ -154,14 +157,15 @@ def mirror_warnings(cameras: Sequence[Camera], eyes_mm: Mapping[str, Floats]) ->
 def view_warnings(
     rig: RigGeometry, views: Mapping[int, Iterable[tuple[Window, Floats]]], camera_paths: Sequence[str]
 ) -> list[InputWarning]:
-    """Warn of cameras whose images show no eye at any head position.
+    """Warn of cameras whose images show no eye at any head position; a camera without windows is none of them.
 
     Args:
         rig: the rig.
         views: camera -> the windows (x0, y0, width, height) to be rendered, each with the corneal apex (3,) it shows.
         camera_paths: path of each camera in the input, for messages.
     """
-    blind = [c for c, camera in enumerate(rig.cameras) if not any(_in_view(camera, w, eye) for w, eye in views[c])]
+    seen = {c: [_in_view(rig.cameras[c], window, eye) for window, eye in views[c]] for c in range(len(rig.cameras))}
+    blind = [c for c, shown in seen.items() if shown and not any(shown)]
     everywhere = "; nothing of any eye is in view" if len(blind) == len(rig.cameras) else ""
     return [InputWarning(code="out-of-view", reason=f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
 
@@ -247,6 +251,11 @@ def _misplaced(
             if ok and np.all(np.abs(on_screen) < np.array(screen.size_mm) / 2):
                 return "behind-screen", f"the {what} is behind the screen, as the {name} sees it"
     return None
+
+
+def _served(eyes_mm: Mapping[str, Floats], eyes: Sequence[str] | None) -> dict[str, Floats]:
+    """Return the apexes of the eyes that a camera sees or a lamp lights; their names begin with the side."""
+    return {name: eye for name, eye in eyes_mm.items() if eyes is None or name.split()[0] in eyes}
 
 
 def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:

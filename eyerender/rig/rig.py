@@ -12,8 +12,8 @@ from pydantic import Field, model_validator
 
 from ..base.arrays import ArrayValue, Bools, Ints
 from ..base.errors import InputError
-from ..base.spec import Spec
-from .camera import Camera, PinholeCamera, Side
+from ..base.spec import Side, Spec
+from .camera import Camera, PinholeCamera
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import Mount
 from .screen import Screen, ScreenPlane

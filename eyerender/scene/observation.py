@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import ArrayValue, Bools, Columns, Floats, Ints, Objects, Statuses, column, frozen
 from ..base.errors import InputError, Problems
+from ..base.spec import EYES as EYES
 from ..base.status import Status
 from ..base.storage.files import shown
 
 RECORD_SCHEMA = "eyerender/record/3"
 """Schema of a record."""
-EYES = ("right", "left")
 
 # Largest number of boundary points of one pupil (ten per degree) and of all pupils of a batch; a point takes 25 bytes.
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
@@ -107,6 +107,7 @@ class PupilFeatures(Columns):
         arcs_deg: (n, m, 2) visible arcs of the true boundary, from and to in degrees of the stop's parameter; NaN where
             there are fewer than m.
         arc_ellipse: (n, 5) (cx, cy, a, b px, angle rad); NaN where the visible points do not determine it.
+        confidence: (n,) probability that the pupil is right, from an extractor; NaN if unknown.
     """
 
     status: Statuses
@@ -120,6 +121,7 @@ class PupilFeatures(Columns):
     covariance: Floats = column(5, 5)
     arcs_deg: Floats = column(0, 2)
     arc_ellipse: Floats = column(5)
+    confidence: Floats = column()
 
     @property
     def ok(self) -> Bools:
@@ -243,6 +245,8 @@ class Observations(ArrayValue):
                 if glint_status[j] != Status.NONE
             ],
             **dict.fromkeys(_UNUSED_FEATURES),
+            # Only extractors have one; records of ray optics do not have the key.
+            **({} if np.isnan(pupil.confidence[i]) else {"confidence": float(pupil.confidence[i])}),
         }
 
     @classmethod
@@ -313,6 +317,7 @@ class Observations(ArrayValue):
                 covariance=reader.array("pupil.covariance", (5, 5)),
                 arcs_deg=reader.points("pupil.arcs_deg", "arcs [from, to]"),
                 arc_ellipse=reader.arc_ellipses(),
+                confidence=reader.array("confidence", (), optional=True),
             ),
             glints=reader.glints(),
         )
@@ -346,15 +351,15 @@ class _Reader:
                         self.refuse(k, part, "must be an object")
         self.problems.check()
 
-    def values(self, path: str) -> list[Any]:
+    def values(self, path: str, *, optional: bool = False) -> list[Any]:
         """Return the value at a path of each record; None where it is missing."""
-        return [self._value(k, path) for k in range(len(self.records))]
+        return [self._value(k, path, optional) for k in range(len(self.records))]
 
-    def _value(self, k: int, path: str) -> Any:
+    def _value(self, k: int, path: str, optional: bool) -> Any:
         value: Any = self.records[k]
         for key in path.split("."):
             if key not in value:
-                if self.complete:
+                if self.complete and not optional:
                     self.refuse(k, path, "missing")
                 return None
             value = value[key]
@@ -409,9 +414,9 @@ class _Reader:
             self.refuse(int(k), "frame", "missing; number the frames of all records or of none")
         return self.counts("frame")
 
-    def array(self, path: str, shape: tuple[int, ...]) -> Floats:
+    def array(self, path: str, shape: tuple[int, ...], *, optional: bool = False) -> Floats:
         out = np.full((len(self.records), *shape), np.nan)
-        for k, value in enumerate(self.values(path)):
+        for k, value in enumerate(self.values(path, optional=optional)):
             if value is not None:
                 found = _array(value)
                 if found is None or found.shape != shape:

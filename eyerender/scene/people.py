@@ -10,7 +10,7 @@ import numpy as np
 
 from ..base.arrays import Floats, Ints
 from ..base.errors import InputError
-from ..population.model import SIDES
+from ..base.spec import EYES
 from ..population.people import Person, PopulationSpec
 from .subject import Subject
 
@@ -100,5 +100,5 @@ class People:
             if column.ndim == 1:
                 out[name] = column
             else:
-                out |= {f"{name}.{side}": column[:, k] for k, side in enumerate(SIDES)}
+                out |= {f"{name}.{side}": column[:, k] for k, side in enumerate(EYES)}
         return out

@@ -21,12 +21,11 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import ArrayValue, Bools, Floats, Indices
 from ..base.errors import InputError, InputWarning
-from ..base.spec import Spec, file_digest
+from ..base.spec import Side, Spec, file_digest
 from ..base.status import Status
 from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
-from ..eye.parts import Side
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..population.eyes import amplitude_d

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..base.errors import InputError
-from ..base.spec import FileSpec, KeyProblem, Positive, Spec, Vec2, Vec3
+from ..base.spec import FileSpec, KeyProblem, Positive, Side, Spec, Vec2, Vec3
 from ..eye.catalogue import load_eye
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
-from ..eye.parts import Side
 from ..eye.spec import EyeSpec
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region

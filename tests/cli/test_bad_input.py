@@ -226,7 +226,7 @@ TABLE = [
     (["export-scene", "quickstart", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
     (["generate"], 2, "SPEC"),
     (["generate", "dataset_quick"], 2, "--output: give the folder to write"),
-    (["generate", "nonsense", "out"], 2, "nonsense: no such dataset file; shipped: bench_world, dataset_quick"),
+    (["generate", "nonsense", "out"], 2, "nonsense: no such dataset file; shipped: bench_world, dataset_binocular"),
     (["generate", "missing.yaml", "out"], 2, "missing.yaml: no such file"),
     (["generate", "key.yaml", "out"], 2, "key.yaml: is a scene, not a dataset; 'eyerender render SCENE -o DIR' makes"),
     (["generate", "quickstart", "out"], 2, "quickstart: is a scene, not a dataset; 'eyerender render SCENE -o DIR'"),

@@ -25,7 +25,17 @@ COMMANDS = {
     "preview": ["scene.yaml"],
     "validate": ["folder"],
     "export-dataset": ["folder", "--format", "csv"],
-    "gaze fit": ["records.json", "--estimator", "regression", "--scene", "scene.yaml", "--columns", "columns.yaml"],
+    "gaze fit": [
+        "records.json",
+        "--estimator",
+        "regression",
+        "--scene",
+        "scene.yaml",
+        "--columns",
+        "columns.yaml",
+        "--targets",
+        "targets.csv",
+    ],
     "gaze predict": ["records.csv", "-c", "calibration.json", "--rig", "rig.yaml"],
     "render": ["scene.yaml", "--eye", "eye.yaml"],
     "quickstart": ["--eye", "eye.yaml"],
@@ -89,9 +99,9 @@ def test_every_command_and_every_output_is_in_the_table():
     assert set(OPTIONS) == set(targets.OUTPUTS)
     # What a command writes to has one of these names; these are all others of paths and texts.
     inputs = {
-        "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "calibration", "eye", "eyes", "name",
-        "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations", "side", "shard",
-        "address", "against", "recording", "population", "unknowns", "require", "folders", "scenes",
+        "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "targets", "calibration", "eye",
+        "eyes", "name", "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations",
+        "side", "shard", "address", "against", "recording", "population", "unknowns", "require", "folders", "scenes",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command

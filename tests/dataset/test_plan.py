@@ -27,7 +27,13 @@ PEOPLE = ("people_eyelink", "people_iris_camera", "people_nvgaze", "people_opene
 
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
-    assert sorted(shipped_datasets()) == ["bench_world", "dataset_quick", "dataset_region", *PEOPLE]
+    assert sorted(shipped_datasets()) == [
+        "bench_world",
+        "dataset_binocular",
+        "dataset_quick",
+        "dataset_region",
+        *PEOPLE,
+    ]
     for name, path in shipped_datasets().items():
         spec = DatasetSpec.load(path)
         spec.dump(tmp_path / "copy.yaml")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,8 @@ from eyerender.dataset.export import export
 from eyerender.dataset.validate import validate
 from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.folders.imagefile import read_image, write_png
-from eyerender.imaging.labels import EyeInWindow
+from eyerender.imaging.labels import EyeInWindow, known_labels
+from eyerender.imaging.lines import image_line
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping
 
@@ -157,21 +157,12 @@ def test_lines_of_a_rendered_folder_are_computed_again():
     observed = trace(scene)
     truth = SceneTruth(scene.frames(), observed)
     view = EyeInWindow.of(scene.frames(), 0)
-    line: dict[str, Any] = {
-        "window_px": dict(zip(("x0", "y0", "width", "height"), view.window, strict=True)),
-        "bit_depth": scene.spec.sensor.bit_depth,
-        "gamma": scene.spec.sensor.gamma,
-        "records": list(observed.take([0]).records()),
-        "labels": {"lid_margins_px": None},
-        "parameters": {
-            "eye_model": scene.eye_spec.name,
-            "pupil_diameter_mm": scene.pupil_diameter_mm,
-            "wavelength_nm": scene.spec.wavelength_nm,
-            "spp": scene.spec.image.spp,
-            "seed": scene.spec.seed,
-            "camera": view.camera,
-        },
-    }
+    (record,) = observed.take([0]).records()
+    labels = known_labels(scene, observed, view)
+    labels["glints"] = [{**glint, "spot_xy_px": None, "hidden_by": "visible"} for glint in labels["glints"]]
+    line = image_line(scene, record, view.window, {**labels, "lid_margins_px": None})
     assert truth.again(line).problems == ()
     line["records"][0]["pupil"]["points_px"][3][0] += 0.01
     assert any("points_px" in problem for problem in truth.again(line).problems)
+    line["labels"]["space"]["world"]["cornea_centre_mm"][0] += 0.01
+    assert any("cornea_centre_mm" in problem for problem in truth.again(line).problems)

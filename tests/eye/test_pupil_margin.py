@@ -9,9 +9,10 @@ import pytest
 
 from eyerender.analytic.observer import trace
 from eyerender.base.errors import InputError
+from eyerender.base.spec import Side
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.margin import HARMONICS, PupilMargin, drawn_contour
-from eyerender.eye.parts import ConicSpec, Side
+from eyerender.eye.parts import ConicSpec
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec

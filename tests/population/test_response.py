@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import eyerender as er
+from eyerender.base.spec import EYES
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.entrance import entrance_pupil_mm
 from eyerender.eye.refraction import at_cornea_d, refraction_d
 from eyerender.imaging.capture import focus_dpt
-from eyerender.population.model import SIDES
 from eyerender.population.pupil import watson_yellott_mm
 from eyerender.population.response import responding
 from eyerender.scene.scene import demand_d
@@ -84,7 +84,7 @@ def test_drawn_eyes_are_focused_by_their_own_refraction():
     scene = er.Scene.of(er.SceneSpec.from_mapping(scene_mapping(population={**myope.to_mapping(), "subject": 2})))
     person, frames = scene.spec.person, scene.frames()
     assert demand_d(scene.spec, scene.targets_mm) == 0.0
-    for row, side in enumerate(SIDES):
+    for row, side in enumerate(EYES):
         # Spectacles 12 mm before the cornea.
         far_point_mm = -1000.0 / person.number("refraction_d", side) + 12.0
         assert focus_dpt(frames, row) == pytest.approx(1000.0 / far_point_mm)

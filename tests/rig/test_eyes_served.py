@@ -33,8 +33,7 @@ RING = 8
 
 
 def both_eyes(**image) -> Scene:
-    changes = {"region": None, "image": {"spp": 4, **image}}
-    return load_scene("headset_binocular").with_(**changes)
+    return load_scene("headset_binocular").with_({"region": None, "image": {"spp": 4, **image}})
 
 
 def one_eye(scene: Scene, side: str) -> Scene:

@@ -125,7 +125,7 @@ def test_rigs_in_records_say_that_they_are_mirrored_and_are_read_back():
     assert again.cameras[0].mirrored
     points = np.array([[0.0, -31.5, 0.0], [1.0, -30.0, 2.0]])
     np.testing.assert_allclose(again.cameras[0].project(points)[0], rig.cameras[0].project(points)[0], atol=1e-12)
-    assert "mirrored" not in scene().rig.to_mapping()["cameras"][0]
+    assert scene().rig.to_mapping()["cameras"][0]["mirrored"] is None
     with pytest.raises(InputError, match=r"cameras\.0\.mirrored: must be a valid boolean"):
         rig_from_mapping({**data, "cameras": [{**data["cameras"][0], "mirrored": 1}]})
 

@@ -136,7 +136,7 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
     assert np.abs(found.pupil.centre_px - truth.pupil.centre_px).max() < 0.5
     metadata = tmp_path / "out" / "metadata.jsonl"
     line = json.loads(metadata.read_text())
-    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/2"}, {"schema": "eyerender/image/5"}):
+    for wrong in ({"gamma": "2"}, {"gamma": 0.0}, {"schema": "eyerender/image/3"}, {"schema": "eyerender/image/4"}):
         metadata.write_text(json.dumps({**line, **wrong}) + "\n")
         with pytest.raises(InputError, match=next(iter(wrong))):
             ImageFolder.load(tmp_path / "out")

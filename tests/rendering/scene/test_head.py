@@ -163,7 +163,7 @@ def test_reasons_name_the_part(renderer, folder, part, word):
     free = only(scene_of(folder, head_of(parts={"skin": ["face"]})), renderer)
     barred = only(scene, renderer)
     first = labels_of(barred)["glints"][0]
-    assert first["reason"] == f"occluded by {word}"
+    assert first["hidden_by"] == f"occluded by {word}"
     assert first["visible_share"] == 0
     # The bar, 1 mm high before the pupil of 4 mm or so, takes its band out of it.
     (_, y0, z0), (x1, y1, z1) = BAR_MM

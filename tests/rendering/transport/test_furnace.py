@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from eyerender.base.errors import InputError
+from eyerender.base.spec import EYES
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
-from eyerender.population.model import SIDES
 from eyerender.region.anatomy import Region
 from eyerender.region.look import Look
 from eyerender.rig.camera import Camera
@@ -40,7 +40,7 @@ def brightest(renderer, count: int, seed: int) -> float:
     """The brightest class of some drawn people."""
     people, most = Population().draw(count, seed), 0.0
     for k in range(count):
-        person, side = people.person(k), SIDES[k % 2]
+        person, side = people.person(k), EYES[k % 2]
         eye = person.eye(side).build(eye=side)
         means = class_means(renderer, eye, person.look(), person.region().of_side(side))
         assert set(means) >= {0, 1, 2}
