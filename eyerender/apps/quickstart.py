@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ from ..gaze.estimate import GazeEstimator
 from ..gaze.regression import Regression
 from ..imaging.comparison import Comparison, compare
 from ..imaging.folder import render_folder
-from ..imaging.imageobserver import ImageObserver, scene_of
+from ..imaging.imageobserver import ImageObserver, rigs_of
 from ..report.comparison import Timing, write_report
 from ..rig.plausibility import saturation_warnings
-from ..scene import Scene, load_scene
+from ..rig.rig import RigGeometry
+from ..scene import load_scene
 
 REPORT = "report.html"
 
@@ -86,7 +88,7 @@ def run_quickstart(
     if warn is not None:
         saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
         warn(saturation_warnings(saturated, len(images.entries), loaded.source))
-    result = _compared(images, loaded, Regression(), "", step(count, "extracting"))
+    result = _compared(images, [loaded.rig] * len(images), Regression(), "", step(count, "extracting"))
     timings.append(Timing("extracting and calibrating", time.monotonic() - start))
     write_report(folder / REPORT, loaded, result, images.entries, timings)
     notify(progress, 2 * count + 1, 2 * count + 1, "done")
@@ -110,15 +112,16 @@ def compare_folder(
         InputError: the folder is of another kind, or an image or a record in it cannot be read.
     """
     images = ImageFolder.load(path)
-    return _compared(images, scene_of(images), estimator or Regression(), name, progress)
+    return _compared(images, rigs_of(images), estimator or Regression(), name, progress)
 
 
 def _compared(
-    images: ImageFolder, scene: Scene, estimator: GazeEstimator, name: str, progress: Progress | None
+    images: ImageFolder, rigs: Sequence[RigGeometry], estimator: GazeEstimator, name: str, progress: Progress | None
 ) -> Comparison:
     truth = images.truth()
-    found = ImageObserver().observe_entries(images.entries, truth.index, scene, progress=progress)
-    return compare(truth, found, scene.rig, estimator, name, subjects=_subjects(images))
+    found = ImageObserver().observe_entries(images.entries, truth.index, rigs, progress=progress)
+    own = [rig for entry, rig in zip(images, rigs, strict=True) for _ in entry.records]
+    return compare(truth, found, own, estimator, name, subjects=_subjects(images))
 
 
 def _subjects(images: ImageFolder) -> Ints | None:

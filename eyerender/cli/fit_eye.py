@@ -72,4 +72,6 @@ def _text(found: dict[str, Any], output: Path) -> str:
                 lines.append(f"  {name:<16} {value['change']:>+10.4f} {spread}")
         if one["not_seen"]:
             lines.append(f"  not seen: {', '.join(one['not_seen'])}")
+        if one["file"] is None:
+            lines.append(f"  no eye file: {one['file_reason']}; give narrower priors with --unknowns")
     return "\n".join([*lines, f"written to {output}"])

@@ -136,7 +136,8 @@ def extract(
         lines = (json_module.dumps(one, allow_nan=False) + "\n" for one in records)
         table = is_table(output)
         write_text(output, features_csv(observed, lights_of(loaded)) if table else "".join(lines), sync=False)
-    data = {"schema": "eyerender/features/1", "rig": None, "records": records}
+    rig = None if loaded is None else loaded.rig.to_mapping()
+    data = {"schema": "eyerender/features/1", "rig": rig, "records": records}
     names = None
     if observed.index.camera.max() < 0:  # another program rendered the folder
         paths = files_of(images)

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..base.errors import InputError
 from ..base.storage.files import write_json, write_text
+from ..eye.spec import EyeSpec
 from ..folders.outfolder import staged
 from .fit import EyeFit
 
@@ -17,11 +19,23 @@ FIT = "fit.json"
 def write_fits(output: str | Path, fits: Sequence[EyeFit], *, overwrite: bool = False) -> dict[str, Any]:
     """Write right.yaml, left.yaml and fit.json into a folder; return the content of fit.json.
 
+    An eye that fits the features, but is physically impossible, has no file: its `file` is null, with a `file_reason`.
+
     Raises:
         InputError: the folder is not empty.
     """
-    found = {"schema": SCHEMA, "eyes": [{**fit.to_mapping(), "file": f"{fit.eye}.yaml"} for fit in fits]}
-    specs = {fit.eye: fit.spec for fit in fits}
+    specs: dict[str, EyeSpec] = {}
+    reasons: dict[str, str | None] = {}
+    for fit in fits:
+        try:
+            specs[fit.eye], reasons[fit.eye] = fit.spec, None
+        except InputError as error:
+            reasons[fit.eye] = str(error)
+    eyes = [
+        {**fit.to_mapping(), "file": f"{fit.eye}.yaml" if fit.eye in specs else None, "file_reason": reasons[fit.eye]}
+        for fit in fits
+    ]
+    found = {"schema": SCHEMA, "eyes": eyes}
     with staged(output, overwrite=overwrite) as folder:
         for eye, spec in specs.items():
             write_text(folder / f"{eye}.yaml", spec.to_yaml())

@@ -185,7 +185,7 @@ def feature_errors(truth: Observations, found: Observations) -> FeatureErrors:
 def compare(
     truth: Observations,
     found: Observations,
-    rig: RigLike,
+    rig: RigLike | Sequence[RigLike],
     estimator: GazeEstimator,
     name: str = "",
     *,
@@ -201,7 +201,7 @@ def compare(
     Args:
         truth: the reference, such as observations of the analytic observer.
         found: observations of the same frames and eyes, row by row, such as those of the image observer.
-        rig: the rig of both.
+        rig: the rig of both, or that of each row. If the rig differs between rows of a subject, gaze is not estimated.
         estimator: gaze estimator for both; every target is estimated by a calibration on the others.
         name: name of the estimator in the result; default: its class, and a regression's function.
         subjects: (n,) subject of each row, if there are several or targets are drawn: each subject is then calibrated
@@ -225,9 +225,10 @@ def compare(
     pairs: list[list[GazeErrors | None]] = []
     for person in people:
         own: list[GazeErrors | None] = []
+        rows = np.flatnonzero(subjects == person)
         for observations in (truth, found):
             try:
-                own.append(leave_one_target_out(estimator, observations.take(subjects == person), rig))
+                own.append(leave_one_target_out(estimator, observations.take(rows), _common_rig(rig, rows)))
             except InputError as error:
                 own.append(None)
                 reason = str(error)
@@ -244,6 +245,20 @@ def compare(
         subjects=tuple(map(int, people)),
         subject_errors=tuple((own[0], own[1]) for own in pairs),
     )
+
+
+def _common_rig(rig: RigLike | Sequence[RigLike], rows: Ints) -> RigLike:
+    """Return the rig of some rows.
+
+    Raises:
+        InputError: they have different rigs.
+    """
+    if not isinstance(rig, Sequence):
+        return rig
+    first: RigLike = rig[rows[0]]
+    if any(rig[row] is not first and rig[row] != first for row in rows):
+        raise InputError("the rig differs from image to image, so no calibration is possible")
+    return first
 
 
 def _with_fixations(observations: Observations) -> Observations:

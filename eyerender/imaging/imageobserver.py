@@ -25,11 +25,10 @@ from ..extraction.glints.matching import assign_lights, predict_glints
 from ..extraction.overlay import overlay
 from ..extraction.pair import extract_eyes
 from ..extraction.preprocessing import single_threaded
-from ..eye.spec import EyeSpec
 from ..folders.imagefile import image_files, read_any_image, write_png
 from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
-from ..rig.rig import RigGeometry, RigLike
+from ..rig.rig import Rig, RigGeometry, RigLike
 from ..scene import Frames, Scene
 from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from ..scene.spec import SceneSpec
@@ -84,33 +83,36 @@ class ImageObserver:
             ]
         )
 
-    def observe_folder(self, folder: ImageFolder, scene: Scene, *, progress: Progress | None = None) -> Observations:
-        """Extract the features of a folder's images, in the order of its records."""
-        return self.observe_entries(folder.entries, folder.truth().index, scene, progress=progress)
+    def observe_folder(
+        self, folder: ImageFolder, scene: Scene | None = None, *, progress: Progress | None = None
+    ) -> Observations:
+        """Extract the features of a folder's images, in the order of its records; `scene` replaces their rigs."""
+        rigs = rigs_of(folder) if scene is None else [scene.rig] * len(folder.entries)
+        return self.observe_entries(folder.entries, folder.truth().index, rigs, progress=progress)
 
     def observe_entries(
         self,
         entries: Sequence[ImageEntry],
         index: Index,
-        scene: Scene,
+        rigs: Sequence[RigGeometry],
         *,
         progress: Progress | None = None,
         exposed: Callable[[NDArray[Any], ImageEntry], NDArray[Any]] | None = None,
     ) -> Observations:
-        """Extract the features of some images of a scene; `index` has a row for each of their records.
+        """Extract the features of images with a rig for each; `index` has a row for each of their records.
 
         `exposed` converts each image before extraction, for instance to another exposure.
         """
         parts: list[Observations] = []
         few: list[Observations] = []  # single observations take ten times the memory of joined ones
         row = 0
-        for entry in followed(entries, progress):
+        for entry, rig in zip(followed(entries, progress), rigs, strict=True):
             if len(entry.records) == 0:
                 raise InputError("has no records", source=str(entry.path))
             image = entry.image() if exposed is None else exposed(entry.image(), entry)
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
-            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, scene.rig, entry.gamma))
+            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, rig, entry.gamma))
             if len(few) == _BATCH:
                 parts.append(concatenate(few))
                 few = []
@@ -146,7 +148,7 @@ class ImageObserver:
         lenient = len(paths) == 1 and os.path.isdir(paths[0])
         if lenient and os.path.isfile(os.path.join(paths[0], METADATA)):
             folder = ImageFolder.load(paths[0])
-            return self.observe_folder(folder, scene or scene_of(folder), progress=progress)
+            return self.observe_folder(folder, scene, progress=progress)
         paths = files_of(paths)
         if pictures is not None:
             _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
@@ -320,48 +322,34 @@ def detect(
     return ImageObserver(settings=settings or ExtractionSettings()).observe_images(told)
 
 
-def scene_of(folder: ImageFolder) -> Scene:
-    """Rebuild the scene from which a folder of images was rendered."""
-    source = str(folder.path / DATASET)
-    spec = folder.dataset.get("spec")
-    if not isinstance(spec, dict):
-        raise InputError("missing", source=source, path="spec")
-    if folder.dataset.get("kind") == "dataset":
-        return _scene_of_samples(folder)
-    return Scene.of(SceneSpec.from_mapping(spec, source=source), source=source)
+def rigs_of(folder: ImageFolder) -> list[RigGeometry]:
+    """Return the rig that took each image of a folder, in order; equal rigs, but for their power, are one object.
 
-
-def _scene_of_samples(folder: ImageFolder) -> Scene:
-    """Rebuild the scene of a dataset's first sample; all others must share its cameras and lights."""
-    first: Scene | None = None
-    seen: set[str] = set()
+    Raises:
+        InputError: an image's scene is missing or wrong.
+    """
+    if folder.dataset.get("kind") != "dataset":
+        source = str(folder.path / DATASET)
+        spec = folder.dataset.get("spec")
+        if not isinstance(spec, dict):
+            raise InputError("missing", source=source, path="spec")
+        return [Scene.of(SceneSpec.from_mapping(spec, source=source), source=source).rig] * len(folder.entries)
+    found: dict[str, RigGeometry] = {}
+    rigs = []
     for entry in folder:
         source = str(folder.path / entry.name)
         try:
-            text, eye = entry.line["parameters"]["scene_json"], entry.line["parameters"]["eye_json"]
+            text = entry.line["parameters"]["scene_json"]
             if not isinstance(text, str):
                 raise TypeError
             rig = parse_json(text)["rig"]
-            key = json.dumps([rig["cameras"], [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
+            key = json.dumps([{**rig, "lights": None}, [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
         except (InputError, KeyError, TypeError, ValueError):
             raise InputError("has no parameters", source=source) from None
-        if first is None:
-            spec = SceneSpec.from_mapping(parse_json(text), source=source)
-            first = Scene.compiled(spec, EyeSpec.from_mapping(_parsed(eye, source), source=source))
-        seen.add(key)
-        if len(seen) > 1:
-            raise InputError(
-                "the rig differs from image to image, so no calibration is possible", source=str(folder.path)
-            )
-    if first is None:
-        raise InputError("holds no images", source=str(folder.path))
-    return first
-
-
-def _parsed(text: Any, source: str) -> Any:
-    if not isinstance(text, str):
-        raise InputError("must be text", source=source, path="parameters.eye_json")
-    return parse_json(text, source=source, path="parameters.eye_json")
+        if key not in found:
+            found[key] = Rig.from_mapping(rig, source=source).resolved().build()
+        rigs.append(found[key])
+    return rigs
 
 
 def _around(image: NDArray[Any], corner: Floats, centre_px: Floats, half_px: float) -> tuple[NDArray[Any], Floats]:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from eyerender.cli.main import run
 from eyerender.folders.imagefolder import ImageFolder
-from eyerender.imaging.imageobserver import scene_of
+from eyerender.imaging.imageobserver import rigs_of
 from tests.support.dataset_specs import tree, write
 
 pytestmark = pytest.mark.render
@@ -139,7 +139,7 @@ def test_commands_report_as_json(tiny, capsys):
 
 
 def test_a_dataset_of_one_rig_can_be_compared(tiny):
-    scene = scene_of(ImageFolder.load(tiny))
+    rig = rigs_of(ImageFolder.load(tiny))[5]
     labels = ImageFolder.load(tiny).entries[5].line["labels"]
-    np.testing.assert_array_equal(scene.rig.cameras[0].K, labels["camera"]["K"])
-    np.testing.assert_array_equal(scene.rig.cameras[0].t, labels["camera"]["t_mm"])
+    np.testing.assert_array_equal(rig.cameras[0].K, labels["camera"]["K"])
+    np.testing.assert_array_equal(rig.cameras[0].t, labels["camera"]["t_mm"])

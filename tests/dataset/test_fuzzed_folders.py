@@ -26,7 +26,7 @@ from eyerender.dataset.validate import validate
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder, finished
 from eyerender.gaze.records import load_observations
-from eyerender.imaging.imageobserver import scene_of
+from eyerender.imaging.imageobserver import rigs_of
 from tests.support.dataset_specs import make_or_skip, plan
 from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict_json
 
@@ -158,7 +158,7 @@ def use(folder: Path, action: str, out: Path) -> Any:
                 if path is not None:
                     read_image(path)
         strict_json(list(found.truth().records()))
-        return scene_of(found).rig
+        return rigs_of(found)
     if action in ("validate", "deep"):
         report = validate(folder, quick=action == "validate", deep=action == "deep")
         strict_json(report)

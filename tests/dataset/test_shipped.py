@@ -27,10 +27,10 @@ def small(name):
     """A shipped scene with one sample a pixel, and of its directions and head positions the first and the last."""
     scene = load_scene(name, spp=1)
     data = scene.spec.to_mapping()
-    if data.get("targets"):
+    if "grid" in data["targets"]:
         data["targets"] = {"grid": [2, 2]}
     else:
-        data["poses"] = [data["poses"][0], data["poses"][-1]]
+        data["targets"] = {kind: [points[0], points[-1]] for kind, points in data["targets"].items()}
     heads = data["subject"]["head_positions_mm"]
     data["subject"]["head_positions_mm"] = heads if len(heads) == 1 else [heads[0], heads[-1]]
     return Scene.of(SceneSpec.from_mapping(data))
@@ -67,6 +67,7 @@ def test_eyes_seen_from_the_side_validate(eye, tmp_path):
     """The outlines hold for tilted and biconic corneas too, up to where rays just miss the rim."""
     data = load_scene("head_mounted", spp=1).spec.to_mapping()
     data["eye"] = {"model": eye, "pupil_diameter_mm": 6.0}
+    del data["targets"]
     data["poses"] = [{"azimuth_deg": -35, "elevation_deg": -25}, {"azimuth_deg": 35, "elevation_deg": -25}]
     try:
         render_folder(Scene.of(SceneSpec.from_mapping(data)), tmp_path / "out")

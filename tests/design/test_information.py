@@ -75,7 +75,7 @@ def test_two_cameras_are_the_sum_of_both(scene):
     second = spec.rig.cameras[0].model_copy(update={"position_mm": (32.0, -20.0, -18.0)})
     data = spec.rig.to_mapping()
     cameras = [spec.rig.cameras[0], second]
-    both = er.Scene(spec.subject, er.Rig.from_mapping({**data, "cameras": cameras}), poses=spec.poses)
+    both = er.Scene(spec.subject, er.Rig.from_mapping({**data, "cameras": cameras}), targets=spec.targets)
     alone = []
     for camera in (0, 1):
         frames = both.frames()
@@ -219,7 +219,7 @@ def test_fewer_leds_see_less(scene, noise):
     six = information(scene.frames(), unknowns=unknowns, noise=noise)["right"].axis_deg.mean()
     data = scene.spec.rig.with_light(0).to_mapping()
     one = er.Rig.from_mapping({**data, "lights": data["lights"][:1]})
-    frames = er.Scene(scene.spec.subject, one, eye=scene.spec.eye, poses=scene.spec.poses).frames()
+    frames = er.Scene(scene.spec.subject, one, eye=scene.spec.eye, targets=scene.spec.targets).frames()
     single = information(frames, unknowns=unknowns, noise=FeatureNoise.of(0.07, 0.0085, rig=frames.scene.rig))
     assert single["right"].axis_deg.mean() > 3 * six
 

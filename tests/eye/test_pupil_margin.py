@@ -106,6 +106,7 @@ def test_the_shift_is_seen_in_the_picture():
     # cornea, n / s' - 1 / s = (n - 1) / R, and a pinhole.
     data = load_scene("head_mounted").spec.to_mapping()
     data["rig"]["cameras"][0] |= {"position_mm": [60.0, -31.5, 0.0], "look_at_mm": [0.0, -31.5, 0.0]}
+    del data["targets"]
     data["poses"] = [{"azimuth_deg": 0.0, "elevation_deg": 0.0}]
     centres = []
     for diameter in (4.0, 6.0):

@@ -201,8 +201,10 @@ def test_the_command_without_images(capsys, tmp_path):
     assert [c["name"] for c in data["causes"]] == ["estimator", "eye model", "optics"]
     assert data["transferred"] == []
     assert f"{data['mean_deg']:.4f} deg" in capsys.readouterr().out
-    assert run(["budget", "head_mounted", "--estimator", "regression"]) == 2
-    assert "error: head_mounted: there are no targets" in capsys.readouterr().err
+    posed = er.load_scene("head_mounted").with_(gaze_deg=(5.0, 3.0)).spec
+    posed.dump(tmp_path / "posed.yaml")
+    assert run(["budget", str(tmp_path / "posed.yaml"), "--estimator", "regression"]) == 2
+    assert "posed.yaml: there are no targets" in capsys.readouterr().err
 
 
 @pytest.mark.render

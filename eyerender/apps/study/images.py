@@ -80,7 +80,8 @@ class StudyImages:
             return expose_again(scene.spec.sensor, codes, seed, entry.window[:2])
 
         again = None if noise_seed is None else exposed
-        return ImageObserver().observe_entries(self.of(scene), scene.index(), scene, exposed=again)
+        entries = self.of(scene)
+        return ImageObserver().observe_entries(entries, scene.index(), [scene.rig] * len(entries), exposed=again)
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[EyeShot]:
