@@ -102,7 +102,7 @@ def extract(
         processes: Number of images processed at the same time (default: one per processor).
     """
     from ..base.storage.files import make_folder, refuse_special, write_text
-    from ..extraction.video import is_video
+    from ..extraction.video import VideoReader, is_video
     from ..gaze.records import is_table
     from ..gaze.table import features_csv
     from ..imaging.imageobserver import ImageObserver, files_of, lights_of
@@ -118,6 +118,7 @@ def extract(
     if is_video(images[0]):
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))
+        VideoReader(images[0])  # which refuses what is no video, before any warning
         heed(_gamma_warnings(gamma, images[0]))
         with progress("extracting") as steps:
             files = VideoOutput(output, overlay)

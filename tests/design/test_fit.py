@@ -36,6 +36,8 @@ EYES = ("E1", "E2", "E3", "E4", "E5")
 
 def frames_of(name, eye="E2", most=9):
     scene = er.Scene.of(er.load_scene(name).spec, eye=eye)
+    if name == "head_mounted":
+        scene = scene.with_(gaze_deg=[(azimuth, elevation) for elevation in (12, 0, -12) for azimuth in (15, 0, -15)])
     frames = scene.frames()
     rows = np.flatnonzero((frames.index.eye == frames.index.eye.min()) & (frames.index.head == 0))
     return frames.take(rows[np.linspace(0, len(rows) - 1, most).astype(int)])
@@ -406,7 +408,7 @@ def test_the_command_writes_an_eye_file_that_loads(tmp_path, capsys):
     assert found["schema"] == "eyerender/fit-eye/1"
     (eye,) = found["eyes"]
     assert eye["chi2"] < 1.0
-    assert [f["azimuth_deg"] for f in eye["frames"]] == pytest.approx([15, 0, -15] * 3, abs=1e-3)
+    assert [f["azimuth_deg"] for f in eye["frames"]] == pytest.approx([15, 0, -15] * 3, abs=5e-3)
     assert er.load_eye(str(folder / "right.yaml")).build().side == "right"
     (tmp_path / "u.yaml").write_text("kapa_deg: 1\n")
     assert run(["fit-eye", str(records), "-o", str(tmp_path / "x"), "--unknowns", str(tmp_path / "u.yaml")]) == 2

@@ -52,8 +52,8 @@ def test_scene_view_shows_rig_and_rays():
 
 
 def test_scene_view_says_what_it_shows_and_what_is_missing():
-    title = scene_view(load_scene("headset"))._suptitle.get_text().splitlines()
-    assert title[1] == "pose 1 of 9: azimuth 20\N{DEGREE SIGN}, elevation 15\N{DEGREE SIGN}, head position 1 of 1"
+    title = scene_view(load_scene("headset").with_(gaze_deg=(20, 15)))._suptitle.get_text().splitlines()
+    assert title[1] == "pose 1 of 1: azimuth 20\N{DEGREE SIGN}, elevation 15\N{DEGREE SIGN}, head position 1 of 1"
     assert title[2].startswith("no glint: outside the limbus (right eye, camera 0, light ")
     whole = scene_view(load_scene("quickstart"))._suptitle.get_text().splitlines()
     assert whole[1].startswith("target 1 of 9 at (")

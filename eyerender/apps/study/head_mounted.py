@@ -40,6 +40,7 @@ def scene(eye: str) -> Scene:
     """Build the shipped scene with more directions: 5 x 5 over the range of its 3 x 3."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
+    data["targets"] = None
     data["poses"] = [{"azimuth_deg": a, "elevation_deg": e} for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG]
     return Scene.of(SceneSpec.from_mapping(data, source=SCENE))
 
