@@ -58,9 +58,9 @@ class ShihWuLiu(Recalibrated):
             InputError: there are fewer than six usable targets, or the cameras do not see the same eye.
         """
         rig = rig.build()
+        rays = self.optic_axes(observations, rig)
         if not len(self._pairs(observations)[0]):
             raise InputError(f"no eye is seen by both cameras {self.cameras[0]} and {self.cameras[1]} at one moment")
-        rays = self.optic_axes(observations, rig)
         # One row of each pair is used, so that every fixation counts once.
         rows = np.flatnonzero(observations.index.camera == self.cameras[0])
         part = GazeRays.of(rays.origin_mm[rows], rays.direction[rows], rays.reason[rows].copy())
