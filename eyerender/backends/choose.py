@@ -1,6 +1,6 @@
 """The choice of the backend: the processor (llvm) or an NVIDIA GPU (cuda).
 
-Call `choose_backend` before anything imports mitsuba or drjit (see `llvm`); it sets Mitsuba's variant.
+`choose_backend` sets Mitsuba's variant. What Dr.Jit reads at its import, `hook` has set by then.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..base.errors import BackendError, InputError
 from ..base.storage.cachefolder import cache_folder, private_folder
 from ..base.versions import package_version
 from .libraries import load_runtime
-from .llvm import ensure_llvm
+from .llvm import ensure_llvm, select_llvm
 from .probe import Verdict, cpu_name, probe
 from .remedies import CUDA_FIX
 
@@ -82,8 +82,8 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
 
     Raises:
         InputError: no such backend, or `threads` below 1.
-        BackendError: no backend renders, or mitsuba was imported earlier with a libLLVM that does not; the message says
-            how to fix it.
+        BackendError: no backend renders, or drjit was imported before eyerender with a libLLVM that does not; the
+            message says how to fix it.
     """
     if name not in ("auto", "cuda", "llvm"):
         raise InputError(f"must be auto, cuda or llvm, not {name!r}", path="backend")
@@ -91,7 +91,6 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
         raise InputError(f"must be >= 1, not {threads}", path="threads")
     if package_version("mitsuba") == "unknown":
         raise BackendError("mitsuba is not installed; run: pip install mitsuba")
-    _keep_kernels_private()
     if name != "llvm":
         cuda = cuda_state()
         if cuda.ok:
@@ -103,14 +102,19 @@ def choose_backend(name: BackendChoice = "auto", threads: int | None = None) -> 
     return _start("llvm", cpu_name(), threads, llvm=library.version, library=path)
 
 
+def prepare_drjit() -> None:
+    """Set what Dr.Jit reads when it is first imported (`hook`). Where no libLLVM renders, it loads what it finds."""
+    _keep_kernels_private()
+    with contextlib.suppress(OSError):
+        load_runtime()
+        select_llvm()
+
+
 def _keep_kernels_private() -> None:
     """Make Dr.Jit store its kernels, which are executable code, in a folder that only this user can write to.
 
-    Without such a folder, a temporary one is used while this process runs. Dr.Jit reads the variable when it is first
-    imported, so this has no effect afterwards.
+    Without such a folder, a temporary one is used while this process runs.
     """
-    if "drjit" in sys.modules:
-        return
     given = os.environ.get(KERNELS)
     place = private_folder(Path(given).absolute()) if given else cache_folder()
     if place is not None and not given:

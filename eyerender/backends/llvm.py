@@ -2,8 +2,8 @@
 
 On Linux x86-64 the wheel karellen-llvm-core provides it; elsewhere it must be installed on the system. Some versions
 are rejected, and some end the process at their first kernel, so each candidate is probed in a separate process
-(`probe`). Dr.Jit loads a libLLVM only when drjit is first imported. `ensure_llvm` runs before that, or checks what was
-loaded.
+(`probe`). Dr.Jit loads a libLLVM only when drjit is first imported. `select_llvm` runs before that (`hook`), and
+`ensure_llvm` checks what was loaded.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class LibLlvm:
         return cls(path, verdict.detail.removeprefix("LLVM "))
 
 
+_selected: LibLlvm | None = None
 _active: LibLlvm | None = None
 
 
@@ -76,23 +77,18 @@ def ensure_llvm() -> LibLlvm:
     """Make Dr.Jit in this process use a libLLVM that renders.
 
     Raises:
-        BackendError: there is none, or drjit was imported before and has loaded another, or none; the message says how
-            to fix it.
+        BackendError: there is none, or drjit was imported before eyerender and has loaded another, or none; the message
+            says how to fix it.
     """
     global _active
     if _active is None:
-        _active = _loaded() if "drjit" in sys.modules else _activate()
+        _active = _loaded()
     return _active
 
 
-def version_of(path: Path) -> tuple[int, ...]:
-    """Parse the version in a file name such as "libLLVM-19.so" or "libLLVM.19.1.dylib"; () if there is none."""
-    match = re.match(r"(?:lib)?LLVM(?:-C)?[-.](?:so\.)?(\d+(?:\.\d+)*)", path.name)
-    return tuple(int(part) for part in match[1].split(".")) if match else ()
-
-
-def _activate() -> LibLlvm:
-    before = os.environ.get(ENVIRONMENT)
+def select_llvm() -> None:
+    """Load the first libLLVM that renders, if any does, and name it to Dr.Jit, which must not be imported yet."""
+    global _selected
     for path, verdict in examine():
         if not verdict.ok:
             continue
@@ -103,40 +99,38 @@ def _activate() -> LibLlvm:
             probe(VARIANT, path, refresh=True)
             continue
         os.environ[ENVIRONMENT] = str(path)
-        import drjit as dr
+        _selected = LibLlvm.probed(path, verdict)
+        return
 
-        if dr.has_backend(dr.JitBackend.LLVM):
-            return LibLlvm.probed(path, verdict)
-        if before is not None:
-            os.environ[ENVIRONMENT] = before
-        raise BackendError(f"Dr.Jit cannot load {path}, although a separate process could")
-    raise BackendError(f"no libLLVM here can render, and the llvm backend needs one; {llvm_fix()}")
+
+def version_of(path: Path) -> tuple[int, ...]:
+    """Parse the version in a file name such as "libLLVM-19.so" or "libLLVM.19.1.dylib"; () if there is none."""
+    match = re.match(r"(?:lib)?LLVM(?:-C)?[-.](?:so\.)?(\d+(?:\.\d+)*)", path.name)
+    return tuple(int(part) for part in match[1].split(".")) if match else ()
 
 
 def _loaded() -> LibLlvm:
-    """Return the library that an earlier import of drjit has loaded, if it renders."""
-    import drjit as dr
-
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        raise BackendError(f"mitsuba was imported earlier and found no libLLVM; {_too_late()}")
-    version = ".".join(map(str, dr.detail.llvm_version()))
-    path = _mapped(dr.detail.llvm_version())
-    verdict = probe(VARIANT, path)
-    if not verdict.ok:
-        raise BackendError(
-            f"mitsuba was imported earlier and loaded {path or 'a libLLVM'} (LLVM {version}), which cannot render "
-            f"({verdict.detail}); {_too_late()}"
-        )
-    return LibLlvm(path, version)
-
-
-def _too_late() -> str:
+    """Import drjit and return the library that it has loaded, if it renders."""
+    wrong = "found no libLLVM"
+    try:
+        import drjit as dr
+    except (ImportError, OSError) as error:  # a library that drjit is linked with is missing
+        raise BackendError(f"drjit cannot start: {str(error).splitlines()[0]}; {llvm_fix()}") from error
+    if dr.has_backend(dr.JitBackend.LLVM):
+        if _selected:
+            return _selected
+        version = ".".join(map(str, dr.detail.llvm_version()))
+        path = _mapped(dr.detail.llvm_version())
+        verdict = probe(VARIANT, path)
+        if verdict.ok:
+            return LibLlvm(path, version)
+        wrong = f"loaded {path or 'a libLLVM'} (LLVM {version}), which cannot render ({verdict.detail})"
     found, _ = find_llvm()
     if found is None:
-        return llvm_fix()
-    return (
-        "import mitsuba after eyerender.backends.choose.choose_backend() has run, "
-        f"or set {ENVIRONMENT}={found.path} before Python starts"
+        raise BackendError(f"no libLLVM here can render, and the llvm backend needs one; {llvm_fix()}")
+    raise BackendError(
+        f"drjit was imported before eyerender and {wrong}; start Python again with `import eyerender` above the first "
+        f"import of mitsuba or drjit, or with {ENVIRONMENT}={found.path} in the environment"
     )
 
 

@@ -1,1 +1,1 @@
-"""Rendering with Mitsuba 3. Call `backends.choose.choose_backend` before importing a module of this package."""
+"""Rendering with Mitsuba 3."""

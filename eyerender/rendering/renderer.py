@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class Renderer:
-    """Renderer of jobs on one backend; call `choose_backend` before importing this module.
+    """Renderer of jobs on one backend.
 
     Kernels are compiled once per structure of the eye; all numbers may change between jobs.
 

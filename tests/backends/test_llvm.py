@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+import eyerender
 from eyerender.backends import apt as apt_module
 from eyerender.backends.apt import fetch_library
 from eyerender.backends.libraries import WHEEL, load_llvm, load_runtime, runtime_store
@@ -64,14 +65,16 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a new interpreter, as a user's program would run."""
+def python(
+    code: str, unset: tuple[str, ...] = (), timeout: float = 120, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run code in a new interpreter, as a user's program would run, without the variables `unset`."""
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
-        env={**os.environ, **environment},
+        env={name: value for name, value in os.environ.items() if name not in unset} | (environment or {}),
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=timeout,
         check=False,
     )
 
@@ -296,7 +299,7 @@ def test_bad_library_that_the_user_names_is_passed_over(good: Path, tmp_path: Pa
         mi.set_variant("llvm_ad_mono")
         print(dr.minimum(mi.Float(1, 2), 1.5))
         """,
-        **{ENVIRONMENT: str(named)},
+        environment={ENVIRONMENT: str(named)},
     )
     assert done.returncode == 0, done.stderr
     path, result = done.stdout.splitlines()
@@ -314,31 +317,91 @@ def test_mitsuba_imported_before_with_a_good_library_works(good: Path) -> None:
         from eyerender.backends.choose import choose_backend
         print(choose_backend("llvm").library)
         """
-    done = python(preload, **{ENVIRONMENT: str(good)})
+    done = python(preload, environment={ENVIRONMENT: str(good)})
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).resolve() == good
 
 
-def test_mitsuba_imported_before_without_a_library_is_a_clear_error(good: Path) -> None:
+@pytest.mark.parametrize("named", ["/nonexistent/libLLVM.so", None])
+def test_drjit_imported_before_eyerender_works_or_one_line_says_what_to_do(named: str | None, good: Path) -> None:
+    given = {} if named is None else {ENVIRONMENT: named}
     done = python(
         """
-        from eyerender.backends.libraries import load_runtime
-        load_runtime()
-        import mitsuba
+        try:
+            import mitsuba, sys
+        except ImportError:
+            sys.exit("bare")
         from eyerender.base.errors import BackendError
         from eyerender.backends.choose import choose_backend
         try:
-            choose_backend("llvm")
+            print(0, choose_backend("llvm").library)
         except BackendError as error:
             print(error.exit_code, error)
         """,
-        **{ENVIRONMENT: "/nonexistent/libLLVM.so"},
+        unset=(ENVIRONMENT,),
+        environment=given,
+    )
+    if done.stderr.strip() == "bare":
+        pytest.skip("drjit finds its libraries only after eyerender here")
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 1
+    if done.stdout.startswith("0"):  # the system's newest libLLVM renders
+        assert named is None
+        return
+    assert done.stdout.startswith("3 drjit was imported before eyerender and ")
+    assert "`import eyerender` above the first import" in done.stdout
+    fix = re.search(rf"{ENVIRONMENT}=(\S+)", done.stdout)  # any that is good: a machine may hold several
+    assert fix is not None
+    assert Path(fix[1]).is_file()
+
+
+def test_libllvm_that_renders_is_loaded_whatever_imports_drjit(good: Path) -> None:
+    """By way of a module of the package that needs drjit, before a backend is chosen; kernels stay private."""
+    done = python(
+        """
+        import os, eyerender.rendering.hits.meshes
+        from eyerender.backends.choose import choose_backend
+        import drjit as dr
+        print(choose_backend("llvm").library, os.environ["DRJIT_CACHE_DIR"], dr.detail.llvm_version()[0])
+        """,
+        unset=(ENVIRONMENT, "DRJIT_CACHE_DIR"),
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("3 mitsuba was imported earlier")
-    named = re.search(rf"{ENVIRONMENT}=(\S+)", done.stdout)  # any that is good: a machine may hold several
-    assert named is not None
-    assert Path(named[1]).is_file()
+    library, kernels, version = done.stdout.split()
+    assert version_of(Path(library).resolve())[:1] in ((int(version),), ())
+    assert "eyerender" in kernels
+
+
+@pytest.mark.slow
+def test_every_public_name_leaves_the_choice_of_libllvm_open(good: Path) -> None:
+    """Each name in a process of its own, with `import mitsuba` after it, then a kernel."""
+    names = eyerender.__all__
+    code = """
+        import os, sys, eyerender as er
+        from eyerender.backends.choose import choose_backend
+
+        def check(name):
+            getattr(er, name)
+            import mitsuba
+            choose_backend("llvm")
+            import drjit as dr
+            return float(dr.sum(mitsuba.Float([1, 2]) * 2)[0]) == 6
+
+        failed = []
+        for name in {names!r}:
+            child = os.fork()
+            if child == 0:
+                try:
+                    os._exit(0 if check(name) else 1)
+                except BaseException as error:
+                    print(name, error, file=sys.stderr)
+                    os._exit(2)
+            if os.waitpid(child, 0)[1]:
+                failed.append(name)
+        print(failed)
+        """
+    done = python(code.format(names=names), unset=(ENVIRONMENT,), timeout=900)
+    assert done.stdout.strip() == "[]", done.stderr
 
 
 def test_importing_the_room_loads_no_mitsuba() -> None:
