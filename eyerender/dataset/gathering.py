@@ -21,6 +21,8 @@ EXTENDS = "extends"
 def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -> dict[str, Any]:
     """Merge the mapping of a spec into the one that it extends; only mappings are merged, other values are replaced.
 
+    So are splits: their shares are one distribution.
+
     Args:
         data: the mapping.
         file_of: returns the file of a spec, given its path or the name of a shipped one.
@@ -46,7 +48,7 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
         raise InputError(f"is {shown(other)}; this version reads format {known}", source=str(file), path="format")
     below = extended(below, file_of, folder, depth + 1)
     own = {key: value for key, value in data.items() if key != EXTENDS}
-    found: dict[str, Any] = _merged(below, own)
+    found: dict[str, Any] = _merged({k: v for k, v in below.items() if not (k == "splits" and k in own)}, own)
     return found
 
 

@@ -9,7 +9,6 @@ After `attempts` failures, or at once if nothing random is left to draw, the sam
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -245,7 +244,6 @@ def sample_line(
     turn = sample.turn
     (record,) = observations.take([row]).records()
     frame, instant, side = record["frame"], record["instant"], record["eye"]
-    eye = sample.eye or scene.eye_file(side).to_mapping()
     # Numbers of frames and instants are unique in the whole dataset.
     instants = frames // len(scene.rig.cameras)
     record |= {
@@ -263,9 +261,8 @@ def sample_line(
             "attempt": turn.attempt,
             "subject_attempt": turn.subject_attempt,
             "draws": sample.draws,
-            # Stored as text, because their nested keys may differ between samples, which table columns do not allow.
-            "scene_json": json.dumps(sample.scene, sort_keys=True),
-            "eye_json": json.dumps({k: v for k, v in eye.items() if k != "sources"}, sort_keys=True),
         },
+        tree=sample.scene,
+        eye=sample.eye,
     )
     return image_name(turn.sample, frame, frames, side), line

@@ -25,6 +25,7 @@ from .selection import Selection
 MAX_COUNT = 10**9
 _LEAST_SHARDS = 16
 PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
+SPLITS_SLACK = 0.01  # most by which the sum of shares may differ from 1, so that thirds can be written
 SPLIT_NAME = re.compile(r"[a-z][a-z0-9]*")
 _selection = lru_cache(maxsize=16)(Selection)
 
@@ -108,7 +109,7 @@ class DatasetSpec(FileSpec):
         default=None, description="number of identities; each has a run of consecutive samples; default: one per sample"
     )
     splits: dict[str, Positive] = Field(
-        default={"train": 1.0}, description="name -> share of the subjects; shares are scaled to 1"
+        default={"train": 1.0}, description="name -> share of the subjects; shares add up to 1"
     )
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="selects all draws")
     variables: dict[str, Any] | None = Field(
@@ -159,12 +160,17 @@ class DatasetSpec(FileSpec):
         for key in ("population", "person"):
             if key in self.scene:
                 raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")
+        self._check_splits()
+        return self
+
+    def _check_splits(self) -> None:
         if not self.splits:
             raise ValueError("splits: give at least one")
         for name in self.splits:
             if not SPLIT_NAME.fullmatch(name):
                 raise ValueError(f"splits.{name}: a name must consist of lower-case letters and digits")
-        return self
+        if abs((total := sum(self.splits.values())) - 1) > SPLITS_SLACK:
+            raise ValueError(f"splits: shares must add up to 1, not {total:g}")
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:

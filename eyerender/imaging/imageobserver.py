@@ -26,12 +26,11 @@ from ..extraction.overlay import overlay
 from ..extraction.pair import extract_eyes
 from ..extraction.preprocessing import single_threaded
 from ..folders.imagefile import image_files, read_any_image, write_png
-from ..folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ..folders.imagefolder import METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..scene import Frames, Scene
 from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
-from ..scene.spec import SceneSpec
 from .capture import EyeImage, render_windows
 
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
@@ -328,12 +327,6 @@ def rigs_of(folder: ImageFolder) -> list[RigGeometry]:
     Raises:
         InputError: an image's scene is missing or wrong.
     """
-    if folder.dataset.get("kind") != "dataset":
-        source = str(folder.path / DATASET)
-        spec = folder.dataset.get("spec")
-        if not isinstance(spec, dict):
-            raise InputError("missing", source=source, path="spec")
-        return [Scene.of(SceneSpec.from_mapping(spec, source=source), source=source).rig] * len(folder.entries)
     found: dict[str, RigGeometry] = {}
     rigs = []
     for entry in folder:

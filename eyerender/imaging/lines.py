@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ from ..rig.camera import Window
 from ..scene import Scene
 
 SAMPLE_KEYS = ("sample", "split", "sequence_index")
-DRAWN_KEYS = ("attempt", "subject_attempt", "draws", "scene_json", "eye_json")
+DRAWN_KEYS = ("attempt", "subject_attempt", "draws")
 """Keys of a line and of its `parameters` that only a dataset's lines fill."""
 
 
@@ -22,6 +23,8 @@ def image_line(
     *,
     sample: Mapping[str, Any] | None = None,
     drawn: Mapping[str, Any] | None = None,
+    tree: Mapping[str, Any] | None = None,
+    eye: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the line of an image; the keys of files are null.
 
@@ -32,7 +35,11 @@ def image_line(
         labels: its labels.
         sample: values of `SAMPLE_KEYS`, in a dataset.
         drawn: values of `DRAWN_KEYS`, in a dataset.
+        tree: keys of the scene; default: all.
+        eye: keys of the eye file; default: those of the scene's eye.
     """
+    tree = scene.spec.to_mapping() if tree is None else tree
+    eye = scene.eye_file(record["eye"]).to_mapping() if eye is None else eye
     spec = scene.spec
     return {
         "schema": IMAGE_SCHEMA,
@@ -57,5 +64,8 @@ def image_line(
             **(drawn or {}),
             **dict.fromkeys(("spectacles", "contact_lens")),
             **scene.person_numbers(record["eye"]),
+            # Stored as text, because their nested keys may differ between images, which table columns do not allow.
+            "scene_json": json.dumps(tree, sort_keys=True),
+            "eye_json": json.dumps({key: value for key, value in eye.items() if key != "sources"}, sort_keys=True),
         },
     }

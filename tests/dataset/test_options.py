@@ -19,7 +19,7 @@ def loaded(path, **options):
 
 
 def test_subjects_and_splits_are_replaced(tmp_path):
-    plan = loaded(write(tmp_path / "tiny.yaml"), subjects=8, splits="train=3,test=1")
+    plan = loaded(write(tmp_path / "tiny.yaml"), subjects=8, splits="train=.75,test=.25")
     assert Counter(plan.split_of(s) for s in range(8)) == {"train": 6, "test": 2}
     assert [plan.subject_of(i)[0] for i in (0, 2, 3, 23)] == [0, 0, 1, 7]
 
@@ -51,6 +51,7 @@ def test_the_camera_scales_with_the_size(tmp_path, camera):
         ({"size": "48"}, "--size: must be WIDTHxHEIGHT in pixels, not '48'"),
         ({"size": "0x0"}, "--size: must be WIDTHxHEIGHT"),
         ({"splits": "train:1"}, "--splits: must be NAME=SHARE,NAME=SHARE"),
+        ({"splits": "train=8,test=2"}, "--splits: splits: shares must add up to 1, not 10"),
         ({"splits": "Train=1"}, "--splits: splits.Train: a name must consist of"),
         ({"subjects": 25}, "--subjects: subjects: must be <= count, or planned where it is given"),
     ],

@@ -75,7 +75,7 @@ def test_more_samples_of_a_function_are_the_same_plan():
 
 
 def test_subjects_of_a_function_share_what_it_draws_for_them():
-    made = Plan.load(f"{OWN}:drawn", count=6, changes=PlanOptions(subjects=2, splits="train=1,test=1"))
+    made = Plan.load(f"{OWN}:drawn", count=6, changes=PlanOptions(subjects=2, splits="train=.5,test=.5"))
     drawn = [made.draw(k) for k in range(6)]
     assert [d.turn.subject for d in drawn] == [0, 0, 0, 1, 1, 1]
     assert len({d.scene["look"]["iris_albedo"] for d in drawn}) == 2

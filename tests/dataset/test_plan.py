@@ -296,7 +296,7 @@ def test_eyes_of_several_models():
 
 
 def test_a_million_subjects_are_split_by_rank_and_more_by_thresholds():
-    splits = {"b": 3.0, "a": 1.0, "c": 6.0}
+    splits = {"b": 0.3, "a": 0.1, "c": 0.6}
     few = plan(count=999, subjects=None, splits=splits)
     counts = Counter(few.split_of(s) for s in range(999))
     assert counts == {"a": 100, "b": 300, "c": 599}
@@ -307,7 +307,7 @@ def test_a_million_subjects_are_split_by_rank_and_more_by_thresholds():
     expected = ["a" if u < 0.1 else "b" if u < 0.4 else "c" for u in numbers]
     assert [many.split_of(s) for s in range(999)] == expected
     assert "_ranked" not in vars(many)
-    assert plan(count=10**9, subjects=None, splits={"all": 2}).split_of(10**9 - 1) == "all"
+    assert plan(count=10**9, subjects=None, splits={"all": 1}).split_of(10**9 - 1) == "all"
 
 
 def test_the_splits_of_existing_datasets_do_not_change():

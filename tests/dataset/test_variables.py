@@ -145,6 +145,8 @@ def test_a_spec_extends_another(tmp_path):
     made = Plan.load(tmp_path / "child.yaml")
     assert made.spec.scene == expected["scene"]
     assert made.digest == Plan.of(type(made.spec).from_mapping(expected)).digest
+    (tmp_path / "child.yaml").write_text(yaml.safe_dump({**child, "splits": {"rest": 0.8, "test": 0.2}}))
+    assert Plan.load(tmp_path / "child.yaml").spec.splits == {"rest": 0.8, "test": 0.2}
     (tmp_path / "base.yaml").write_text(yaml.safe_dump({"extends": "base.yaml"}))
     with pytest.raises(InputError, match=r"child.yaml: extends: must be a dataset file"):
         Plan.load(tmp_path / "child.yaml")

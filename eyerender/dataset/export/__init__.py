@@ -17,7 +17,7 @@ from ...base.errors import InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json, write_text
 from ...folders.exported import EXPORT
-from ...folders.imagefolder import DATASET, ImageFolder
+from ...folders.imagefolder import ImageFolder
 from ...folders.outfolder import staged
 from ..assemble import verify_dataset
 from ..validation.problems import WRONG
@@ -63,12 +63,14 @@ def export(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write a generated dataset in another layout; on an error, nothing is left behind.
+    """Write a folder of labelled images in another layout; on an error, nothing is left behind.
+
+    Images of a rendered folder count as those of one subject in the split `train`.
 
     >>> er.export("out", "coco", "out_coco")  # doctest: +SKIP
 
     Args:
-        path: the dataset's folder.
+        path: the folder, written by `render`, `quickstart` or `generate`.
         format: one of `FORMATS`.
         out: the folder to write.
         bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
@@ -81,7 +83,7 @@ def export(
         progress: called with images done, images in all and "".
 
     Raises:
-        InputError: the layout or encoding is unknown, the folder is not a generated dataset, a checksum is wrong,
+        InputError: the layout or encoding is unknown, the folder is of another kind, a checksum is wrong,
             labels differ from what this version writes, or `out` is not empty.
         EyerenderError: `out` cannot be written.
     """
@@ -89,11 +91,9 @@ def export(
     if workers < 1:
         raise InputError("must be >= 1", source="--workers")
     folder = ImageFolder.load(path)
-    if folder.dataset.get("kind") != "dataset":
-        raise InputError("is not a generated dataset (its kind is not 'dataset')", source=str(Path(path) / DATASET))
     if format == "labels":
         labels.check_packed(folder)
-    for problem in verify_dataset(folder.path):
+    for problem in verify_dataset(folder.path) if folder.dataset.get("kind") == "dataset" else ():
         raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(path))
     total = len(folder.entries)
 

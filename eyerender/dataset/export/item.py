@@ -27,6 +27,7 @@ from .encoding import RAW, Encoding
 Prepared = TypeVar("Prepared")
 LinePlace = tuple[Path, int]
 _COUNTS = ("file_name", "noiseless_file_name")  # pictures whose values are encoded
+UNSPLIT = "train"  # split of images that are in none
 _CHUNK = 16  # images that a process prepares at a time
 
 
@@ -37,10 +38,15 @@ class Item:
     entry: ImageEntry
     encoding: Encoding = RAW
 
-    @property
+    @cached_property
     def line(self) -> dict[str, Any]:
-        """Metadata of the image."""
-        return self.entry.line
+        """Metadata of the image; an image of a rendered folder counts as a sample of one subject, to train on."""
+        line = self.entry.line
+        if line["sample"] is not None:
+            return line
+        number = line["records"][0]["frame"]
+        own = {"sample": number, "split": UNSPLIT, "sequence_index": number, "subject": 0}
+        return {**line, **own, "parameters": {**line["parameters"], "draws": {}}}
 
     @property
     def name(self) -> str:

@@ -146,8 +146,7 @@ class DatasetTruth:
             return Again((f"sample {number} has no such image",))
         scene, view = frames.scene, EyeInWindow.of(frames, row)
         _, expected = sample_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
-        texts = ("scene_json", "eye_json")
-        problems = _differences(_open(expected, texts), _open(line, texts))
+        problems = _differences(_open(expected), _open(line))
         problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
         return Again(tuple(problems), _limbus(scene, view))
 
@@ -212,7 +211,8 @@ class SceneTruth:
         view = EyeInWindow.of(self.frames, row)
         (own,) = found.take([row]).records()
         expected = image_line(scene, own, view.window, known_labels(scene, found, view))
-        problems = [*_differences(expected, line), *_spots(scene, view, line), *_lids(scene, found, view, line)]
+        problems = [*_differences(_open(expected), _open(line)), *_spots(scene, view, line)]
+        problems += _lids(scene, found, view, line)
         return Again(tuple(problems), _limbus(scene, view))
 
 
@@ -236,10 +236,11 @@ def _row(observations: Observations, frame: int, eye: str) -> int | None:
     return int(rows[0]) if len(rows) else None
 
 
-def _open(line: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
+def _open(line: dict[str, Any]) -> dict[str, Any]:
     """Parse the JSON texts in a line into values."""
     parameters = line["parameters"]
-    return {**line, "parameters": {**parameters, **{key: parse_json(parameters[key]) for key in texts}}}
+    texts = {key: parse_json(parameters[key]) for key in ("scene_json", "eye_json")}
+    return {**line, "parameters": {**parameters, **texts}}
 
 
 def _differences(expected: dict[str, Any], line: dict[str, Any]) -> list[str]:
