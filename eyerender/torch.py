@@ -38,7 +38,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 
 from .backends.choose import BackendChoice
 from .base.errors import InputError
-from .base.processes import usable_cpus
+from .base.processes import spawning, usable_cpus
 from .dataset.plan import Plan
 from .dataset.realise import frames_of
 from .dataset.spec import DatasetSpec, GeometryKind
@@ -265,7 +265,7 @@ class StreamDataset(IterableDataset[Any]):
             options: more options of `torch.utils.data.DataLoader`, such as `prefetch_factor`.
         """
         if workers:
-            options.setdefault("multiprocessing_context", "spawn")
+            options.setdefault("multiprocessing_context", spawning())
         return DataLoader(self, batch_size=None, num_workers=workers, **options)
 
     def __iter__(self) -> Iterator[Any]:

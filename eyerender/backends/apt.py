@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from ..base.errors import BackendError
+from ..base.processes import run
 
 PAUSES_S = (3.0, 10.0)
 
@@ -76,7 +77,7 @@ def _private_options(folder: Path) -> list[str]:
 
 
 def _run(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+    return run(
         command,
         cwd=folder,
         env={**os.environ, "LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"},

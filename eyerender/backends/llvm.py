@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..base.errors import BackendError
+from ..base.processes import run
 from .libraries import load_llvm, wheel_libraries
 from .probe import Verdict, probe
 from .remedies import llvm_fix
@@ -182,7 +183,7 @@ def _installed() -> list[Path]:
 def _loader_cache() -> list[Path]:
     for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig", "ldconfig"):
         try:
-            listed = subprocess.run([tool, "-p"], capture_output=True, text=True, timeout=20, check=False).stdout
+            listed = run([tool, "-p"], capture_output=True, text=True, timeout=20, check=False).stdout
         except (OSError, subprocess.TimeoutExpired):
             continue
         return [Path(line.partition("=> ")[2].strip()) for line in listed.splitlines() if "libLLVM" in line]

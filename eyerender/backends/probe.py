@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import EyerenderError, InputError
+from ..base.processes import python_command, run
 from ..base.storage.cachefolder import cache_folder
 from ..base.storage.files import read_json, write_json
 from ..base.versions import package_version
@@ -108,10 +109,10 @@ def run_probe(variant: str, library: Path | None = None, timeout_s: float = TIME
         environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(p) for p in sys.path)
         if library is not None:
             environment["DRJIT_LIBLLVM_PATH"] = str(library)
-        command = [sys.executable, "-P", "-m", "eyerender.backends.probe", variant]
+        command = python_command("eyerender.backends.probe", variant)
         command += [str(library)] if library is not None else []
         try:
-            done = subprocess.run(
+            done = run(
                 command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
             )
         except subprocess.TimeoutExpired:

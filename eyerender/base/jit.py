@@ -33,6 +33,7 @@ from numba.core import config as numba_config
 from numba.core import sigutils
 from numba.core.dispatcher import Dispatcher
 
+from .processes import python_command, start
 from .storage.cachefolder import cache_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -126,9 +127,9 @@ def _compile_missing(program: Program) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     null = subprocess.DEVNULL
     with suppress(OSError), tempfile.TemporaryDirectory(prefix="eyerender-compile-") as claims, ExitStack() as workers:
-        command = [sys.executable, "-P", "-m", program.module, claims]
+        command = python_command(program.module, claims)
         for k in range(1, min(cores, _MOST_WORKERS)):
-            one = subprocess.Popen([*command, str(k)], env=environment, stdin=null, stdout=null, stderr=null)
+            one = start([*command, str(k)], env=environment, stdin=null, stdout=null, stderr=null)
             workers.enter_context(one)  # it waits for the process at the end
         compile_share(Path(claims), 0, program)
     with suppress(OSError):

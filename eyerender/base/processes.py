@@ -1,19 +1,26 @@
-"""Worker processes: pools that end with their caller and leave Ctrl-C to it."""
+"""Every child process starts here: programs, and worker processes that end with their caller and leave Ctrl-C to it.
+
+Python puts the current folder, or that of a script, first on the path of modules, so `python -c` or `-m` in a
+stranger's folder would import its `threading.py`. All processes of this package search a safe path instead, as with
+Python's option `-P`.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from multiprocessing import active_children, get_context, parent_process
+from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.connection import wait
+from multiprocessing.context import SpawnContext, SpawnProcess
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -23,9 +30,46 @@ Result = TypeVar("Result")
 _PENDING = 3  # tasks per process of `ordered` that are at work or wait, which limits what is in memory
 
 
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # multiprocessing builds its own command line, without `-P`
+
+
 def usable_cpus() -> int:
     """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def python_command(module: str, *arguments: str) -> list[str]:
+    """Return the command that runs a module with this Python, on a safe path."""
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+def start(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
+    """Start a program; takes the options of `subprocess.Popen` and raises like it."""
+    return subprocess.Popen(list(command), **options)
+
+
+def run(command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[Any]:
+    """Run a program to its end; takes the options of `subprocess.run` and raises like it."""
+    return subprocess.run(list(command), **options)
+
+
+class _SafeProcess(SpawnProcess):
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:
+        with environment(_SAFE_PATH):
+            return SpawnProcess._Popen(process_obj)
+
+
+class _SafeContext(SpawnContext):
+    Process = _SafeProcess
+
+
+def spawning() -> SpawnContext:
+    """Return the context of multiprocessing whose processes start anew, on a safe path."""
+    if os.name == "posix":
+        with environment(_SAFE_PATH):
+            resource_tracker.ensure_running()  # queues start this process before any worker starts
+    return _SafeContext()
 
 
 @contextmanager
@@ -100,7 +144,7 @@ def process_pool(
             libraries.
     """
     before = active_children()
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=initializer) as pool:
+    with ProcessPoolExecutor(processes, mp_context=spawning(), initializer=initializer) as pool:
         with signals_held(), ExitStack() as around:
             if alone:
                 around.enter_context(caller_hidden())

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..base.errors import InputWarning
 from ..base.progress import Progress
-from ..base.storage.files import write_json
+from ..base.storage.files import printable, write_json
 
 if TYPE_CHECKING:
     from ..scene import Scene
@@ -64,7 +64,7 @@ def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None 
         return
     if target is not None:
         write_json(target, data)
-    print(text)
+    print(printable(text, keep="\n\t"))  # it may hold text of a stranger's file
 
 
 @contextmanager

@@ -7,7 +7,6 @@ again. As with the local engine, only the main process puts shards in place.
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import os
 import signal
 import threading
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import EyerenderError, InputError
-from ..base.processes import caller_hidden, signals_held
+from ..base.processes import caller_hidden, signals_held, spawning
 from .done import cpu_family
 from .pool import RECYCLE_IMAGES, TRIES, Events, Retries, end_of
 from .shard import Staged, write_shard
@@ -90,7 +89,7 @@ class RayEngine:
         if find_spec("ray") is None:
             raise InputError("needs Ray (the extra 'ray'); run: pip install ray", source="--engine")
         driver = _Driver(self.job, self.workers, self.address, self.timeout_s)
-        context = multiprocessing.get_context("spawn")
+        context = spawning()
         ours, theirs = context.Pipe()
         process = context.Process(target=drive, args=(theirs, driver, list(shards)), daemon=True)
         with signals_held(), caller_hidden():
@@ -191,7 +190,7 @@ class _Driver:
     def run(self, left: Retries, send: SendEvent) -> dict[int, str]:
         """Make shards and send events; raise the same errors as the engine."""
         ray: Any = import_module("ray")
-        variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+        variables = {name: os.environ[name] for name in PASSED_ON if name in os.environ} | {"PYTHONSAFEPATH": "1"}
         try:
             ray.init(
                 address=self.address,

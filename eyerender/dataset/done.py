@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from ..base.errors import InputError
-from ..base.storage.files import MAX_FILE_BYTES, inside, read_json
+from ..base.storage.files import inside, read_json
 from ..base.versions import package_version
 from ..folders.imagefolder import (
     ARRAY_KEYS,
@@ -17,6 +17,7 @@ from ..folders.imagefolder import (
     DONE,
     KINDS,
     LINES,
+    MAX_DONE_BYTES,
     METADATA,
     PACKED_RUN_SCHEMA,
     PACKED_SCHEMA,
@@ -117,7 +118,7 @@ def read_done(folder: Path, shard: int) -> dict[str, Any]:
 
 def read_done_file(path: Path) -> dict[str, Any]:
     """Read a done.json or the checkpoint of a partial shard, checked as in `read_done`."""
-    data = read_json(path, limit=MAX_FILE_BYTES, follow=False)
+    data = read_json(path, limit=MAX_DONE_BYTES, follow=False)
     if data.get("schema") not in (FILES.shard, PACKED.shard):
         raise InputError(f"must have the schema {FILES.shard!r} or {PACKED.shard!r}", source=str(path))
     for key, fits in _DONE_KEYS.items():

@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import EyerenderError, InputError
 from ..base.progress import Progress
-from ..base.storage.files import make_folder, sync_folder, sync_tree
+from ..base.storage.files import inside, make_folder, opened, sync_folder, sync_tree, write_json
 from ..base.storage.lock import final_lock, run_lock
-from ..folders.imagefolder import DONE, RUN, finished, read_run
+from ..folders.imagefolder import DONE, RUN, SHARDS, finished, read_run
 from .assemble import assemble
-from .done import read_done
-from .partial import new_stage, places
+from .done import checksum, read_done
+from .packing import SHARD
+from .partial import new_stage
 from .plan import Plan
-from .runfile import begin, refuse_taken
+from .runfile import begin, check_work, refuse_taken
 from .shard import Staged, commit, verify
 
 SCHEMA = "eyerender/merge/1"
+_REPAIR = "start generate again on the folder to repair it"
 
 
 def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | None = None) -> dict[str, Any]:
     """Put the finished shards of several folders of one run into one folder; assemble the dataset if none is missing.
 
-    Files are linked where both folders are on one file system, and copied otherwise. A shard that several folders hold
-    is taken from the first. Merging again adds what is missing.
+    Only regular files that a shard's done.json lists are copied, and what is copied is compared with the checksums
+    there. A shard that several folders hold is taken from the first. Merging again adds what is missing.
 
     Args:
         parts: folders that `generate --shard K/N` has filled, of the same spec, options and versions.
@@ -56,6 +56,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | 
         plan = Plan.from_mapping(runs[0], places[0])
     except (KeyError, TypeError) as error:
         raise InputError(f"holds no plan ({error})", source=str(places[0] / RUN)) from None
+    check_work(plan.spec, places[0])
     refuse_taken(folder)
     step = progress or (lambda *_: None)
     try:
@@ -81,28 +82,25 @@ def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> N
     for k, (shard, place) in enumerate(sorted(sources.items())):
         problem = next(verify(place, shard, plan.digest, quick=True), None)
         if problem is not None:
-            raise InputError(f"{problem}; start generate again on the folder to repair it", source=str(place))
+            raise InputError(f"{problem}; {_REPAIR}", source=str(place))
         commit(folder, _staged(folder, place, shard))
         step(k + 1, len(sources), "shards")
 
 
 def _staged(folder: Path, place: Path, shard: int) -> Staged:
-    """Link or copy a shard into a temporary folder, for `commit` to put in place."""
+    """Copy a verified shard into a temporary folder, for `commit` to put in place."""
     stage, done = new_stage(folder, shard), read_done(place, shard)
-    for source, own in places(place, stage, shard):
-        if source.is_dir():
-            make_folder(own)
-            for file in source.iterdir():
-                _copied(file, stage / DONE if file.name == DONE else own / file.name)
+    for name, entry in done["files"].items():
+        kind, _, file = name.split("/", 2)
+        source, own = inside(place, name), stage / (SHARD if kind == SHARDS else kind) / file
+        if "/" in file:
+            raise InputError("does not lie in a folder of the shard", source=str(source))
+        make_folder(own.parent)
+        with opened(source, follow=False) as read, open(own, "xb") as write:
+            shutil.copyfileobj(read, write)
+        if checksum(own) != entry["sha256"]:
+            raise InputError(f"differs from its checksum in {DONE}; {_REPAIR}", source=str(source))
+    write_json(stage / DONE, done)
     sync_tree(stage)
     sync_folder(folder)
     return Staged(shard=shard, stage=str(stage), images=done["images"], rejected=0, given_up=0, seconds=0.0, bytes=0)
-
-
-def _copied(source: Path, place: Path) -> None:
-    if source.is_symlink():
-        raise InputError("is a symbolic link", source=str(source))
-    with suppress(OSError):  # another file system, or one without links
-        os.link(source, place)
-        return
-    shutil.copyfile(source, place)

@@ -262,7 +262,7 @@ def stages(folder: Path) -> Iterator[tuple[int, Path]]:
     """Return the unfinished shards in a folder, with their temporary folders."""
     for stage in sorted(folder.glob(f"{STAGE}*-*")):
         number = stage.name.removeprefix(STAGE).split("-")[0]
-        if number.isdigit() and stage.is_dir() and not stage.is_symlink():
+        if number.isdecimal() and stage.is_dir() and not stage.is_symlink():
             yield int(number), stage
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import signal
 import time
 from collections import Counter, deque
@@ -14,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from ..base.errors import EyerenderError
-from ..base.processes import caller_hidden, environment, signals_held, threads_of_libraries
+from ..base.processes import caller_hidden, environment, signals_held, spawning, threads_of_libraries
 from .shard import Staged
 from .worker import FAILURES, Job, work
 
@@ -78,7 +77,7 @@ class LocalPool:
         self.size = workers
         self.timeout_s = timeout_s
         self.recycle_images = recycle_images
-        self._context = multiprocessing.get_context("spawn")
+        self._context = spawning()
         self._workers: list[_Worker] = []
         self._made = 0
 

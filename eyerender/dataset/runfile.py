@@ -11,7 +11,7 @@ from typing import Any
 
 from ..base.errors import InputError
 from ..base.progress import Say
-from ..base.storage.files import MAX_FILE_BYTES, PART, read_json, remove_file, remove_parts, write_json
+from ..base.storage.files import PART, read_json, remove_file, remove_parts, write_json
 from ..base.storage.lock import LOCK
 from ..folders.imagefolder import DATASET, KINDS, LOG, METADATA, RUN, SHARDS, STAGE, finished
 from ..folders.outfolder import MARKER, clear
@@ -21,6 +21,9 @@ from .croissant import CROISSANT
 from .done import FILES, PACKED, read_done, run_versions
 from .environment import environment
 from .plan import Plan
+from .spec import DatasetSpec
+
+MAX_SHARDS, MAX_CHOICES = 1_000_000, 100_000_000
 
 _OWN = {RUN, LOG, SHARDS, *KINDS, METADATA, INDEX, FAILURES, CARD, CROISSANT, DATASET}
 _ELSE = "choose another folder or give --overwrite"
@@ -44,6 +47,18 @@ def refuse_taken(folder: Path) -> None:
         raise InputError(f"{link}: is a symbolic link; {_ELSE}", source=str(folder))
     if taken:
         raise InputError("is not empty; choose another folder or give --overwrite", source=str(folder))
+
+
+def check_work(spec: DatasetSpec, folder: Path) -> None:
+    """Check that the shards of a run that somebody else made can be listed quickly.
+
+    Raises:
+        InputError: there are too many, or too many samples to choose from.
+    """
+    shards, choices = -(-spec.planned_count // spec.shard_size), spec.count if spec.selection.spread else 0
+    if shards > MAX_SHARDS or choices > MAX_CHOICES:
+        reason = f"is too large: at most {MAX_SHARDS} shards, or {MAX_CHOICES} samples of subjects in turn, are listed"
+        raise InputError(reason, source=str(folder / RUN), path="spec.count")
 
 
 def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
@@ -138,7 +153,7 @@ def _read(path: Path) -> tuple[dict[str, Any] | None, str]:
         InputError: a run of another version wrote it.
     """
     try:
-        found = read_json(path, limit=MAX_FILE_BYTES, follow=False)
+        found = read_json(path, follow=False)
     except InputError as error:
         return None, error.reason
     if found.get("schema") not in (FILES.run, PACKED.run):

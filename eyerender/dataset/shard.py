@@ -177,5 +177,5 @@ def remove_leftovers(folder: Path, mine: set[int], done: set[int]) -> None:
     for kind in (*KINDS, SHARDS):
         if (folder / kind).is_dir():
             for place in (folder / kind).iterdir():
-                if place.name.isdigit() and int(place.name) in missing:
+                if place.name.isdecimal() and int(place.name) in missing:
                     shutil.rmtree(place, ignore_errors=True)

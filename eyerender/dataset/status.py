@@ -18,14 +18,16 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import InputError
-from ..base.storage.files import opened, parse_json
+from ..base.storage.files import opened, parse_json, printable
 from ..folders.imagefolder import DATASET, LOG, RUN, finished, read_run
 from .partial import checkpoints
+from .runfile import check_work
 from .spec import DatasetSpec
 
 SCHEMA = "eyerender/status/1"
 SILENT_S = 180.0
 """A part at work writes to the log once a minute; after this silence it counts as stalled or killed."""
+_MAX_LOG_BYTES, _MAX_EVENT_BYTES = 64 * 2**20, 2**16
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
 
 
@@ -79,9 +81,14 @@ class _Part:
     shard_images: int = 0  # images in shards whose size is known
 
     def take(self, event: dict[str, Any]) -> None:
-        """Process an event of the log."""
+        """Process an event of the log.
+
+        Raises:
+            KeyError: the event lacks a key.
+            ValueError: a number is not plausible.
+        """
         kind = event["event"]
-        self.last, self.seconds = str(event["time"]), float(event["seconds"])
+        self.last, self.seconds = printable(str(event["time"])[:40]), _number(event["seconds"])
         if kind == "start":
             self.state, self.images, self.retries = "running", 0, 0
         elif kind in ("end", "stop"):
@@ -89,9 +96,9 @@ class _Part:
         elif kind == "retry":
             self.retries += 1
         elif kind == "shard":
-            self.bytes += int(event.get("bytes", 0))
-            self.shard_images += int(event["images"])
-        self.images = max(self.images, int(event.get("made", 0)))
+            self.bytes += int(_number(event.get("bytes", 0)))
+            self.shard_images += int(_number(event["images"]))
+        self.images = max(self.images, int(_number(event.get("made", 0))))
 
     @property
     def rate(self) -> float | None:
@@ -114,9 +121,11 @@ def status(path: str | Path) -> dict[str, Any]:
     folder = Path(path)
     run = read_run(folder)
     try:
-        selection = DatasetSpec.from_mapping(run["spec"]).selection
-    except (KeyError, InputError) as error:
+        spec = DatasetSpec.from_mapping(run["spec"])
+    except (KeyError, TypeError, InputError) as error:
         raise InputError(f"has no spec that can be read ({error})", source=str(folder / RUN), path="spec") from None
+    check_work(spec, folder)
+    selection = spec.selection
     parts = _parts(folder)
     shards, there = selection.shards, finished(folder)
     done = sorted(there.intersection(shards))
@@ -153,7 +162,7 @@ def _parts(folder: Path) -> list[_Part]:
     found: dict[tuple[str, str], _Part] = {}
     for event in _events(folder / LOG):
         with suppress(KeyError, TypeError, ValueError):
-            key = str(event["host"]), str(event.get("part", "1/1"))
+            key = printable(str(event["host"])[:80]), printable(str(event.get("part", "1/1"))[:40])
             found.setdefault(key, _Part(host=key[0], part=key[1])).take(event)
     now = time.time()
     for part in found.values():
@@ -163,12 +172,20 @@ def _parts(folder: Path) -> list[_Part]:
     return list(found.values())
 
 
+def _number(value: Any) -> float:
+    """Convert a number of the log."""
+    number = float(value)
+    if not 0 <= number <= 1e15:
+        raise ValueError("not plausible")
+    return number
+
+
 def _events(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the events of a log; lines truncated by a power cut are skipped."""
     if not path.is_file():
         return
-    with opened(path, follow=False) as file:
-        for raw in file:
+    with opened(path, limit=_MAX_LOG_BYTES, follow=False) as file:
+        while raw := file.readline(_MAX_EVENT_BYTES):
             with suppress(InputError):
                 event = parse_json(raw)
                 if isinstance(event, dict):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import Bytes, Ints, Singles
 from ..base.errors import InputError, Refuse, UnfinishedRunWarning
-from ..base.storage.files import MAX_FILE_BYTES, inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
+from ..base.storage.files import inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
 from ..base.storage.jsonlines import JsonLines, LineFiles
 from ..base.versions import package_version
 from ..rig.camera import Window
@@ -35,6 +35,7 @@ DATASET_SCHEMA, PACKED_SCHEMA = "eyerender/dataset/1", "eyerender/dataset/2"
 """Schemas of dataset.json where each picture is a file, and where shards are packed."""
 METADATA, DATASET = "metadata.jsonl", "dataset.json"
 RUN = "run.json"  # present from the start in a folder that `generate` fills
+MAX_DONE_BYTES = 80 * 2**20  # a done.json of 100,000 samples with all kinds of pictures
 RUN_SCHEMA, PACKED_RUN_SCHEMA = "eyerender/run/1", "eyerender/run/2"
 LOG = "log.jsonl"
 # Files of a finished shard. LINES is not called metadata.jsonl, because loaders of image folders would read it, too.
@@ -353,7 +354,7 @@ class ImageFolder:
                 f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
             )
         schema, source = PACKED_SCHEMA if packed else DATASET_SCHEMA, str(folder / DATASET)
-        dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
+        dataset = read_json(folder / DATASET, limit=MAX_DONE_BYTES, follow=False)
         if dataset.get("schema") != schema:
             reason = f"is {shown(dataset.get('schema'))}; this version reads {schema!r}"
             raise InputError(reason, source=source, path="schema")
@@ -450,7 +451,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: there is none, or it is damaged or of another version.
     """
-    run = read_json(folder / RUN, limit=MAX_FILE_BYTES, follow=False)
+    run = read_json(folder / RUN, follow=False)
     if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
         raise InputError("does not describe a run of this version", source=str(folder / RUN))
     return run
@@ -467,7 +468,7 @@ def finished(folder: Path) -> set[int]:
     if not place.is_dir():
         return set()
     # There may be tens of thousands of shards, for which paths as text are three times as fast.
-    return {int(name) for name in os.listdir(place) if name.isdigit() and os.path.isfile(f"{place}/{name}/{DONE}")}
+    return {int(name) for name in os.listdir(place) if name.isdecimal() and os.path.isfile(f"{place}/{name}/{DONE}")}
 
 
 def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], source: str) -> NDArray[Any]:
@@ -493,7 +494,7 @@ def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], sou
 def packed_lines(folder: Path, shards: Sequence[int]) -> PackedLines:
     """Return the metadata of some packed shards, located by their done.json."""
     files = {shard: _shard_file(folder, shard, DONE) for shard in shards}
-    dones = {shard: read_json(file, limit=MAX_FILE_BYTES, follow=False) for shard, file in files.items()}
+    dones = {shard: read_json(file, limit=MAX_DONE_BYTES, follow=False) for shard, file in files.items()}
     splits = tuple(sorted({str(name) for done in dones.values() for name in done.get("splits") or ()}))
     parts = [packed_index(done, shard, splits, str(files[shard])) for shard, done in dones.items()]
     rows = np.concatenate([np.zeros(0, dtype=INDEX_TYPE), *parts])

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import Ints
 from ..base.errors import InputError
+from ..base.storage.arrays import mapped_array
 from ..base.storage.files import inside, opened, parse_json
 from ..base.storage.jsonlines import MAX_LINE_BYTES
 from .imagefile import MAX_IMAGE_BYTES
@@ -36,7 +37,7 @@ LINES_SCHEMA = "eyerender/lines/2"
 BLOCK = 32  # lines of a gzip member
 DIGITS = 9  # significant digits of numbers outside the scene and the eye
 MEMBERS = "tar_members"  # key of a packed line: key of a file's name -> first byte and size in the tar
-_MAX_TABLE_BYTES = 256 * 2**20
+_MAX_TABLE_BYTES = 64 * 2**20
 _GZIP = 31  # zlib's `wbits` for a gzip member
 _TEXTS = ("scene_json", "eye_json")  # JSON as text, whose numbers stay exact
 _PLACE = re.compile(r"\[\d+\]")
@@ -164,8 +165,12 @@ def _member(texts: Sequence[bytes]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """Values shared by the lines of each group of a shard, and the paths of the values in each shape."""
+    """Values shared by all lines of a shard and by those of each group, and the paths of the values in each shape.
 
+    The shared values are not repeated per group: memory would grow with the product.
+    """
+
+    shared: Leaves
     tables: dict[str, Leaves]
     shapes: list[list[tuple[str, ...]]]
 
@@ -178,8 +183,8 @@ def _head(path: str, state: tuple[int, ...]) -> _Head:
     if not isinstance(head, dict) or head.get("schema") != LINES_SCHEMA:
         raise InputError(f"must begin with {LINES_SCHEMA!r}", source=path)
     shared, paths = dict(_leaves(head["shared"])), [tuple(path) for path in head["paths"]]
-    tables = {group: shared | dict(_leaves(table)) for group, table in head["tables"].items()}
-    return _Head(tables, [[paths[k] for k in shape] for shape in head["shapes"]])
+    tables = {group: dict(_leaves(table)) for group, table in head["tables"].items()}
+    return _Head(shared, tables, [[paths[k] for k in shape] for shape in head["shapes"]])
 
 
 @lru_cache(maxsize=16)
@@ -225,7 +230,7 @@ def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
             raise InputError(f"is too long (at most {MAX_LINE_BYTES} bytes are read)", source=name, path=where)
         group, shape, *values = parse_json(text, source=name, path=where)
         head = _head(name, state)
-        return _closed(head.tables[group] | dict(zip(head.shapes[shape], values, strict=True)))
+        return _closed(head.shared | head.tables[group] | dict(zip(head.shapes[shape], values, strict=True)))
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
@@ -279,10 +284,7 @@ class PackedLines:
             return self.given
         assert self.file is not None
         path = inside(self.folder, self.file.name)
-        try:
-            rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, OSError, EOFError) as error:
-            raise InputError(f"is not an index of images ({error})", source=str(path)) from None
+        rows = mapped_array(path)
         if rows.dtype != INDEX_TYPE or rows.ndim != 1:
             raise InputError("is not an index of images", source=str(path))
         return rows

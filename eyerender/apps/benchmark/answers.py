@@ -17,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ...base.errors import InputError
+from ...base.processes import python_command, run
 from ...base.references import is_reference
 from ...base.storage.files import read_bytes
 from ...folders.imagefolder import versions
@@ -91,15 +92,13 @@ def code_digest(extractor: ExtractorCommand, timeout_s: float) -> str:
     Raises:
         InputError: there is no such module or callable.
     """
-    if extractor.argv[1:3] != ("-m", WORKER) or not is_reference(extractor.argv[3]):
+    if extractor.argv[2:4] != ("-m", WORKER) or not is_reference(extractor.argv[4]):
         return _digest([path for word in extractor.argv if (path := Path(shutil.which(word) or word)).is_file()])
-    reference = extractor.argv[3]
+    reference = extractor.argv[4]
     if reference.startswith("eyerender."):
         return _digest(sorted(_PACKAGE.rglob("*.py")))
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", WORKER, "--check", reference], capture_output=True, text=True, timeout=timeout_s
-        )
+        done = run(python_command(WORKER, "--check", reference), capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:
         return ""
     if done.returncode == 2:

@@ -27,6 +27,7 @@ from PIL import Image, ImageDraw
 
 from ...base.arrays import Bools
 from ...base.errors import InputError
+from ...base.storage.arrays import mapped_array
 from ...base.storage.files import inside, read_json, read_text
 from ...folders.exported import EXPORT, exported_gamma
 from ...folders.video import unpacked
@@ -82,10 +83,7 @@ def _openeds(folder: Path) -> Iterator[BenchImage]:
         if name is None:
             raise InputError("there is no image of this name in images", source=str(label))
         path = inside(home / "images", name, source=str(label))
-        try:
-            classes = np.load(label, allow_pickle=False, mmap_mode="r")
-        except (OSError, ValueError, EOFError):
-            raise InputError("is not an array of NumPy", source=str(label)) from None
+        classes = mapped_array(inside(folder, label.relative_to(folder).as_posix(), source=str(label)))
         if classes.ndim != 2 or classes.size > _MOST_PIXELS or classes.dtype.kind not in "ui":
             raise InputError("must be an image of whole numbers", source=str(label))
         relative = path.relative_to(folder).as_posix()

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import IO, Self
 
 from ...base.errors import InputError, one_line
+from ...base.processes import start
 from .protocol import Greeting, Reply, Request
 
 _LONGEST_LINE = 4_000_000
@@ -69,7 +70,7 @@ class ExtractorProcess:
         self._buffer = b""
         self._closed = False
         try:
-            self._process = subprocess.Popen(
+            self._process = start(
                 list(argv),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,

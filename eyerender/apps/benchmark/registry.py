@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-import sys
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
 from ...base.errors import InputError
+from ...base.processes import python_command
 from ...base.references import is_reference
 
 GROUP = "eyerender.extractors"
@@ -54,7 +54,7 @@ def resolve(given: str) -> ExtractorCommand:
         return _of_entry_point(name or spec, given, installed[spec])
     if is_reference(spec):
         title = name or spec
-        return ExtractorCommand(title, given, (sys.executable, "-m", WORKER, spec, title))
+        return ExtractorCommand(title, given, tuple(python_command(WORKER, spec, title)))
     try:
         argv = shlex.split(spec)
     except ValueError as error:
@@ -83,7 +83,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 def _of_entry_point(name: str, given: str, entry: EntryPoint) -> ExtractorCommand:
-    argv: tuple[str, ...] = (sys.executable, "-m", WORKER, entry.value, name)
+    argv: tuple[str, ...] = tuple(python_command(WORKER, entry.value, name))
     # Code of other packages is loaded only in the worker, so that it can harm nothing else.
     if entry.value.startswith("eyerender."):
         found: Any = entry.load()

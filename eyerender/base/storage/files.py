@@ -359,10 +359,15 @@ def is_plain(name: object) -> bool:
     )
 
 
+def printable(text: str, keep: str = "") -> str:
+    """Replace characters that a terminal could act upon, except those in `keep`."""
+    return text if text.isprintable() else "".join(c if c.isprintable() or c in keep else "?" for c in text)
+
+
 def shown(value: object, limit: int = 80) -> str:
     """Format a value from a file for a message: one line of printable characters, shortened to `limit`."""
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**limit else "a huge number"
-    text = "".join(c if c.isprintable() else "?" for c in text)
+    text = printable(text)
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
