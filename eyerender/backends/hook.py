@@ -7,29 +7,26 @@ this hook, so afterwards the order of imports is free.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from importlib.abc import MetaPathFinder
-
-from .libraries import is_testing
 
 
 class DrjitHook(MetaPathFinder):
     """Prepare the process when drjit is about to be imported; the usual finders then import it."""
 
-    armed = True
+    prepare: Callable[[], None] | None = None
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> None:
         """Prepare the process once; find nothing."""
-        if fullname == "drjit" and self.armed and not is_testing():
-            self.armed = False
-            from .choose import prepare_drjit
-
-            prepare_drjit()
+        if fullname == "drjit" and self.prepare:
+            prepare, self.prepare = self.prepare, None
+            prepare()
 
 
 HOOK = DrjitHook()
 
 
-def install_hook() -> None:
-    """Put the hook before the other finders."""
-    if HOOK not in sys.meta_path:
-        sys.meta_path.insert(0, HOOK)
+def before_drjit(prepare: Callable[[], None]) -> None:
+    """Call a function once, before drjit is first imported."""
+    HOOK.prepare = prepare
+    sys.meta_path.insert(0, HOOK)
