@@ -300,3 +300,13 @@ def test_one_eye_at_several_places_has_frames_at_each():
 
 def test_examples_need_no_head_without_width():
     assert not [p.name for p in (ROOT / "examples").glob("*.py") if "ipd_mm=0.001" in p.read_text(encoding="utf-8")]
+
+
+def test_none_removes_a_key_or_an_entry() -> None:
+    scene = er.load_scene("guestrin2006").with_({"eye.pupil_diameter_mm": 3.5, "image.spp": 7})
+    again = scene.with_({"image.spp": None, "eye.pupil_diameter_mm": None, "rig.lights.1": None})
+    assert again.spec.image.spp == er.Picture().spp
+    assert again.spec.eye.pupil_diameter_mm is None
+    assert again.spec.rig.lights == scene.spec.rig.lights[:1] + scene.spec.rig.lights[2:]
+    with pytest.raises(er.InputError, match=r"image\.sp: unknown key"):
+        scene.with_({"image.sp": None})

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from eyerender.base.errors import InputError
-from eyerender.base.spec import file_digest, read_yaml
+from eyerender.base.spec import file_digest, parse_yaml, read_yaml
 from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
@@ -321,3 +321,15 @@ def test_schema_describes_the_files_it_is_for():
     bad = quickstart()
     bad["image"]["spp"] = 0
     assert not validator.is_valid(bad)
+
+
+@pytest.mark.parametrize("number", ["010", "-0_7", "66:40", "1:30.5"])
+def test_octal_and_base_60_of_yaml_are_refused(number: str) -> None:
+    with pytest.raises(InputError, match=r"line 2: not valid YAML: .*octal or base 60 in YAML"):
+        parse_yaml(f"a: 1\nb: [{number}]\n", "f.yaml")
+
+
+def test_decimal_numbers_and_quoted_text_are_read() -> None:
+    assert parse_yaml("a: [0, 0.5, 10, -0.25, 1e-3, '010', \"66:40\"]\n", "f") == {
+        "a": [0, 0.5, 10, -0.25, 1e-3, "010", "66:40"]
+    }

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from difflib import get_close_matches
 from typing import Any, NoReturn
 
 # A message may quote a file that somebody else made. Longer parts are shortened in the middle.
@@ -169,6 +170,12 @@ class BackendError(EyerenderError):
     """
 
     exit_code = 3
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Return "did you mean NAME? " for a name that is nearly one of `names`, else an empty text."""
+    near = get_close_matches(name, list(names), n=1)
+    return f"did you mean {near[0]}? " if near else ""
 
 
 def one_line(text: str, limit: int) -> str:

@@ -366,6 +366,13 @@ class _UniqueKeyLoader(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(
                 None, None, f"a number of {len(node.value)} characters", node.start_mark
             )
+        if node.tag in _NUMBERS and isinstance(node, yaml.ScalarNode) and _SURPRISING.match(node.value):
+            raise yaml.constructor.ConstructorError(
+                None,
+                None,
+                f"{shown(node.value)} is octal or base 60 in YAML; write a decimal number, or quotes around text",
+                node.start_mark,
+            )
         try:
             return super().construct_object(node, deep)
         except yaml.YAMLError:
@@ -396,6 +403,8 @@ def _as_mapping(loader: Any, node: Any) -> Any:
     return loader.construct_mapping(node, deep=True)
 
 
+# YAML 1.1 reads 010 as 8 and 66:40 as 4000; nobody who writes them means that.
+_SURPRISING = re.compile(r"^[-+]?(0[0-9_]+$|[0-9_]+:)")
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 # YAML 1.1 reads 1e-3 as text, but everybody means the number.
 _UniqueKeyLoader.add_implicit_resolver(

@@ -632,7 +632,7 @@ Scene.__setattr__ = _refuse_change  # type: ignore[method-assign,assignment]
 
 
 def _put(data: dict[str, Any], path: str, value: Any) -> None:
-    """Set the value at a dotted path of a mapping, creating the mappings on the way."""
+    """Set the value at a dotted path of a mapping, creating the mappings on the way; a None removes what is there."""
     keys = path.split(".")
     here: Any = data
     try:
@@ -643,7 +643,11 @@ def _put(data: dict[str, Any], path: str, value: Any) -> None:
             inner = inner.to_mapping() if isinstance(inner, Spec) else copy(inner)
             here[at] = inner
             here = inner
-        here[int(keys[-1]) if isinstance(here, list) else keys[-1]] = value
+        last: Any = int(keys[-1]) if isinstance(here, list) else keys[-1]
+        if value is None and (isinstance(here, list) or last in here):
+            del here[last]
+        else:
+            here[last] = value
     except (AttributeError, IndexError, TypeError, ValueError):
         raise InputError("there is no such key", path=path) from None
 

@@ -6,7 +6,7 @@ import os
 from functools import cache
 from pathlib import Path
 
-from ..base.errors import InputError
+from ..base.errors import InputError, nearest
 from ..base.spec import read_yaml
 from ..rig.imaging import Surfaces
 from .scene import Scene
@@ -88,7 +88,8 @@ def load_scene(
         elif str(scene) in shipped_files():
             raise InputError(NOT_A_SCENE, source=str(scene))
         elif path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
-            raise InputError(f"no such scene file; shipped scenes: {', '.join(shipped)}", source=str(scene))
+            near = nearest(str(scene), shipped)
+            raise InputError(f"no such scene file; {near}shipped scenes: {', '.join(shipped)}", source=str(scene))
     refuse_folder(path, "a scene file, or the name of a shipped scene")
     spec = SceneSpec.load(path).with_image(spp=spp, surfaces=surfaces)
     if seed is not None:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from ...base.errors import InputError
+from ...base.errors import InputError, nearest
 from ..spec import EyeSpec
 
 FOLDER = Path(__file__).parent
@@ -43,7 +43,8 @@ def load_eye(name_or_path: str | Path) -> EyeSpec:
     path = Path(name_or_path)
     # For a name that no file can have, os.path reports that nothing exists, while Path raises.
     if path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
-        raise InputError(f"no such eye; the catalogue holds {', '.join(catalogue_names())}", source=str(name_or_path))
+        names, near = catalogue_names(), nearest(str(name_or_path), catalogue_names())
+        raise InputError(f"no such eye; {near}the catalogue holds {', '.join(names)}", source=str(name_or_path))
     return EyeSpec.load(path)
 
 
