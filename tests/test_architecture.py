@@ -244,7 +244,7 @@ BOUNDS = {
     "region": 4020,
     "rendering": 12520,
     "report": 970,
-    "rig": 3070,  # cameras and LEDs that serve one eye: headsets
+    "rig": 3130,  # cameras and LEDs that serve one eye: headsets; exposure set by the lights
     "scene": 2150,  # instants, people and times in records
 }
 

@@ -45,7 +45,7 @@ def render(
     refuse_non_empty(output, overwrite)
     if auto_exposure is not None:
         loaded = auto_exposed(loaded, auto_exposure, backend=backend, threads=threads)
-        say(f"exposure: {loaded.spec.sensor.exposure_ms:g} ms")
+        say(f"exposure: {loaded.spec.sensor.time_ms:g} ms")
     with progress("rendering") as steps:
         done = render_folder(
             loaded, output, backend=backend, threads=threads, overwrite=overwrite, exr=exr, progress=steps, warn=heed

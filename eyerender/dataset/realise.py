@@ -53,10 +53,13 @@ class Realised:
         return None if self.frames is None else self.frames.scene
 
     def exposed(self, exposure_ms: float) -> Realised:
-        """Return the sample with another exposure time."""
+        """Return the sample with another exposure time, and with the gain that its scene has set."""
         assert self.sample is not None
-        tree = self.sample.scene
-        sample = replace(self.sample, scene={**tree, "sensor": {**tree.get("sensor", {}), "exposure_ms": exposure_ms}})
+        assert self.scene is not None
+        tree, gain = self.sample.scene, self.scene.spec.sensor.gain_dn_per_e
+        sensor = {**tree.get("sensor", {}), "exposure_ms": exposure_ms}
+        sensor |= {} if gain is None else {"gain_dn_per_e": gain}
+        sample = replace(self.sample, scene={**tree, "sensor": sensor})
         return replace(self, sample=sample, frames=sample.build().frames())
 
     def warnings(self) -> list[InputWarning]:

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.errors import InputError
 from ..rig.camera import PinholeCamera
-from ..rig.exposure import electrons, radiance_to_irradiance
+from ..rig.exposure import electrons, iris_radiance, radiance_to_irradiance
 from ..rig.light import Lamp
 from ..rig.rig import RigGeometry
 from ..rig.sensor import Sensor
@@ -36,7 +36,6 @@ FIXATION_DEG = 0.3
 PUPIL_SHARE = 0.1
 """Light of the dark pupil, as a share of the iris' (chosen)."""
 CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
-_CORNEAL_TRANSMITTANCE = 0.96
 _SAMPLES, _REACH = 400, 6.0
 
 
@@ -99,10 +98,7 @@ def sensor_noise(
         side = next(filter(camera.sees, scene.spec.subject.eyes), scene.spec.subject.eyes[0])
         eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
         lit = {j: lamp for j, lamp in enumerate(lights) if lamp.lights(EYES.index(side))}
-        # Lamps light a cornea that faces them with I / d^2.
-        towards = [lamp.towards(eye_mm) for lamp in lit.values()]
-        irradiance = sum(intensity / distance**2 for intensity, _, distance in towards)
-        radiance = scene.spec.look.iris_albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
+        radiance = iris_radiance(lit.values(), eye_mm, scene.spec.look.iris_albedo)
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
         dark = PUPIL_SHARE * iris
         edge = edge_information(dark, iris, blur, read, sensor.full_well_e)

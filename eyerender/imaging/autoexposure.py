@@ -71,4 +71,4 @@ def settled_exposure_ms(scene: Scene, level: float, renderer: Renderer, *, share
     room = level * sensor.full_scale_dn - sensor.black_dn
     if not charge * sensor.gain > 1e-3 or room <= 0:
         return None
-    return float(f"{min(sensor.exposure_ms * room / (charge * sensor.gain), _LONGEST_MS):.4g}")
+    return float(f"{min(sensor.time_ms * room / (charge * sensor.gain), _LONGEST_MS):.4g}")

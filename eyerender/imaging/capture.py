@@ -249,7 +249,7 @@ def moments(frames: RenderableFrames, row: int, middle: RenderJob) -> tuple[Rend
     motion, sensor = scene.spec.motion, scene.spec.sensor
     if motion is None:
         return ()
-    during = ((np.arange(motion.steps) + 0.5) / motion.steps - 0.5) * sensor.exposure_ms * 1e-3
+    during = ((np.arange(motion.steps) + 0.5) / motion.steps - 0.5) * sensor.time_ms * 1e-3
     delay = sensor.field_delay_ms * 1e-3
     out = []
     for k, time_s in enumerate(np.concatenate([during - delay / 2, during + delay / 2]) if delay else during):

@@ -71,7 +71,7 @@ def render_folder(
                 write_exr(folder / "images" / f"{image.name}.exr", image.irradiance)
             lines.append(line)
             saturated += is_saturated(image.counts, spec.sensor)
-        found = saturation_warnings(saturated, len(lines), scene.source)
+        found = saturation_warnings(saturated, len(lines), scene.source, scene.exposure_excess)
         if warn is not None:
             warn(found)
         statistics = {"images": len(lines), "images_saturated": saturated, "observations": len(truth)}

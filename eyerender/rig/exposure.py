@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -12,11 +13,16 @@ from scipy import ndimage, special
 
 from ..base.arrays import Floats, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
-from .sensor import Sensor
+from .light import Lamp
+from .sensor import DEFAULT_EXPOSURE_MS, Sensor
 from .stray import border
 
 _PLANCK_J_S = 6.62607015e-34
 _LIGHT_M_S = 299792458.0
+IRIS_LEVEL = 0.45  # of full scale, at which automatic exposure puts an iris that faces its lamps
+_LONGEST_MS, _MOST_GAIN = 4.0, 16.0  # 24 dB is the most that sensors of eye trackers amplify
+# Transmittance of the front of the cornea (Fresnel), for light in and out.
+_CORNEAL_TRANSMITTANCE = 0.96
 _STRETCH = 65536  # pixels at a time, so that what is worked on stays in the processor's cache
 NOISE = 0x5E75  # tells the seeds of noise from others
 FEW = 12.0  # below this mean the expansion of a Poisson quantile is too inaccurate, and probabilities are summed
@@ -36,9 +42,46 @@ def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Float
     >>> er.rig.electrons(er.Sensor(), np.full((1, 1), 0.01), 850.0).shape
     (1, 1)
     """
-    energy_j = (sensor.pixel_pitch_um * 1e-6) ** 2 * sensor.exposure_ms * 1e-3
+    energy_j = (sensor.pixel_pitch_um * 1e-6) ** 2 * sensor.time_ms * 1e-3
     photon_j = _PLANCK_J_S * _LIGHT_M_S / (wavelength_nm * 1e-9)
     return np.asarray(irradiance * (sensor.quantum_efficiency * energy_j / photon_j))
+
+
+def iris_radiance(lamps: Iterable[Lamp], eye_mm: Floats, albedo: float, ambient_w_m2: float = 0.0) -> float:
+    """Compute the radiance (mW/mm^2/sr) of a matte iris, in air, of an eye that faces every lamp.
+
+    Args:
+        lamps: lamps that light the eye.
+        eye_mm: (3,) corneal apex in the world.
+        albedo: albedo of the iris.
+        ambient_w_m2: irradiance by other light.
+    """
+    irradiance = 1e-3 * ambient_w_m2
+    for lamp in lamps:
+        intensity, _, distance = lamp.towards(eye_mm)
+        irradiance += intensity / distance**2
+    return albedo / np.pi * irradiance * _CORNEAL_TRANSMITTANCE**2
+
+
+def automatic_exposure(sensor: Sensor, radiance: float, *, lit: bool, wavelength_nm: float) -> Sensor:
+    """Choose exposure time and, if that is not enough, gain, so that an iris of a radiance has `IRIS_LEVEL`.
+
+    Args:
+        sensor: a sensor without exposure time and gain.
+        radiance: radiance of the iris, mW/mm^2/sr.
+        lit: whether LEDs light the eye, which a headset strobes for some milliseconds.
+        wavelength_nm: wavelength of the light.
+    """
+    longest = sensor.exposure_max_ms or (_LONGEST_MS if lit else DEFAULT_EXPOSURE_MS)
+    irradiance = np.array(radiance_to_irradiance(sensor) * radiance)
+    charge = float(electrons(sensor.model_copy(update={"exposure_ms": 1.0}), irradiance, wavelength_nm))
+    wanted = IRIS_LEVEL * (sensor.full_scale_dn - sensor.black_dn) / sensor.gain
+    time_ms = min(wanted / charge, longest) if charge > 0 else longest
+    gain = min(wanted / (charge * time_ms), _MOST_GAIN) if charge > 0 else 1.0
+    chosen: dict[str, float] = {"exposure_ms": float(f"{time_ms:.3g}")}
+    if gain > 1.01:
+        chosen["gain_dn_per_e"] = float(f"{sensor.gain * gain:.3g}")
+    return sensor.model_copy(update=chosen)
 
 
 def expose(

@@ -170,19 +170,27 @@ def view_warnings(
     return [InputWarning(code="out-of-view", reason=f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
 
 
+EXPOSURE_REMEDY = (
+    "lower sensor.exposure_ms, or leave it and sensor.gain_dn_per_e out, so that the scene sets them by its lights"
+)
+"""What helps against white pictures."""
+
+
 def is_saturated(dn: NDArray[Any], sensor: Sensor) -> bool:
     """Return whether more than 20 % of an image's pixels, counts `dn` (h, w), are saturated."""
     return bool(np.count_nonzero(dn >= sensor.saturation_dn) > SATURATED_SHARE * dn.size)
 
 
-def saturation_warnings(saturated: int, images: int, source: str) -> list[InputWarning]:
-    """Warn if some of the images, `saturated` out of `images`, are mostly white."""
+def saturation_warnings(saturated: int, images: int, source: str, excess: float | None = None) -> list[InputWarning]:
+    """Warn if some of the images, `saturated` out of `images`, are mostly white.
+
+    `excess` is the factor by which the exposure exceeds the one that the scene would set by itself.
+    """
     if not saturated:
         return []
-    reason = (
-        f"in {saturated} of {images} images more than {SATURATED_SHARE:.0%} of the pixels are saturated; "
-        "lower sensor.exposure_ms or the lights' intensity_mw_sr"
-    )
+    by_factor = excess is not None and excess > 1
+    remedy = f"divide sensor.exposure_ms by {excess:.2g}, or leave it out" if by_factor else EXPOSURE_REMEDY
+    reason = f"in {saturated} of {images} images more than {SATURATED_SHARE:.0%} of the pixels are saturated; {remedy}"
     return [InputWarning(code="saturated", reason=reason, source=source)]
 
 

@@ -22,6 +22,7 @@ from ..base.spec import NonNegative, Positive, Spec
 # Converters reach full scale slightly below the full well, so saturated pixels all read full scale instead of a noisy
 # level.
 _WELL_AT_FULL_SCALE = 0.98
+DEFAULT_EXPOSURE_MS = 15.0
 Border = Annotated[int, Field(ge=0, le=4096)]
 
 
@@ -34,7 +35,15 @@ class Sensor(Spec):
 
     f_number: Positive = Field(default=2.0, description="working f-number: image distance over aperture diameter")
     pixel_pitch_um: Positive = Field(default=2.8, description="side of a square pixel")
-    exposure_ms: Positive = Field(default=15.0, description="exposure time")
+    exposure_ms: Positive | None = Field(
+        default=None,
+        description="exposure time; default: 15 if `gain_dn_per_e` is given, else a scene sets time and gain by its "
+        "lights, so that the iris of an eye that looks straight ahead has about a quarter of full scale",
+    )
+    exposure_max_ms: Positive | None = Field(
+        default=None,
+        description="longest exposure time that a scene sets; default: 4, or 15 where no LED lights the eye",
+    )
     lens_transmission: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.9, description="transmittance of lens and filter at the wavelength"
     )
@@ -111,6 +120,11 @@ class Sensor(Spec):
         if self.border_dn > self.full_scale_dn:
             raise ValueError(f"border_dn: must be <= {self.full_scale_dn}")
         return self
+
+    @property
+    def time_ms(self) -> float:
+        """Exposure time in ms, with its default filled in."""
+        return DEFAULT_EXPOSURE_MS if self.exposure_ms is None else self.exposure_ms
 
     @property
     def full_scale_dn(self) -> int:

@@ -35,6 +35,7 @@ from ..population.table import default_table
 from ..region.anatomy import Region
 from ..region.face import face_depth
 from ..rig.camera import PinholeCamera, Window
+from ..rig.exposure import automatic_exposure, iris_radiance
 from ..rig.imaging import Ambient
 from ..rig.light import Lamp
 from ..rig.plausibility import (
@@ -46,6 +47,7 @@ from ..rig.plausibility import (
     wavelength_warnings,
 )
 from ..rig.rig import Rig, RigGeometry, RigLike
+from ..rig.sensor import Sensor
 from .observation import EYES, Index, PoseTruth
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 
@@ -185,8 +187,8 @@ class Scene:
     ) -> Scene:
         """Create a scene from validated parts; without a `rig`, that of the spec is built.
 
-        The numbers of calibration files become part of the spec. Without an `eye_spec`, the eye is that of the spec; a
-        drawn person always has individual eyes.
+        The numbers of calibration files, and the exposure that the scene leaves open, become part of the spec. Without
+        an `eye_spec`, the eye is that of the spec; a drawn person always has individual eyes.
 
         Raises:
             InputError: an eye of the person is physically impossible.
@@ -194,6 +196,8 @@ class Scene:
         if (authored := spec.rig.resolved(base)) is not spec.rig:
             spec = spec.model_copy(update={"rig": authored})
         built = spec.rig.build() if rig is None else rig
+        if spec.sensor.exposure_ms is None:
+            spec = spec.model_copy(update={"sensor": _exposed(spec, built)})
         eyes: EyeSpec | _DrawnEyes
         if spec.person is not None:
             eyes = _drawn_eyes(spec, spec.person, built)
@@ -304,6 +308,14 @@ class Scene:
             return self
         subject = self.spec.subject.model_copy(update={"eyes": (side,)})
         return self.replaced(self.spec.model_copy(update={"rig": rig, "subject": subject}))
+
+    @property
+    def exposure_excess(self) -> float:
+        """Factor by which exposure time and gain exceed those that the scene would set by its lights."""
+        own = self.spec.sensor
+        open_ = own.model_copy(update={"exposure_ms": None, "gain_dn_per_e": None})
+        chosen = _exposed(self.spec.model_copy(update={"sensor": open_}), self.rig)
+        return own.time_ms * own.gain / (chosen.time_ms * chosen.gain)
 
     @property
     def name(self) -> str:
@@ -621,6 +633,24 @@ class Scene:
         scale = max(map(view.scale_at, positions))
         width, height = (16 * math.ceil(side_mm * scale / 16) for side_mm in EYE_WINDOW_MM)
         return min(width, w), min(height, h)
+
+
+def _exposed(spec: SceneSpec, rig: RigGeometry) -> Sensor:
+    """Set the exposure time of a sensor that states none; without a gain, by the light on the eyes (`rig/exposure.py`).
+
+    The sensor is one for all cameras, so the camera that receives the most light decides.
+    """
+    if spec.sensor.gain_dn_per_e is not None:
+        return spec.sensor.model_copy(update={"exposure_ms": spec.sensor.time_ms})
+    head, half = np.array(spec.subject.head_positions_mm[0]), spec.subject.ipd_mm / 2
+    albedo, ambient = spec.look.iris_albedo, spec.ambient.irradiance_w_m2
+    brightest, lit = 0.0, False
+    for side, y in (("right", -half), ("left", half)):
+        if side in spec.subject.eyes and any(camera.sees(side) for camera in rig.cameras):
+            lamps = [rig.lights[k] for k in rig.lights_of(EYES.index(side))]
+            brightest = max(brightest, iris_radiance(lamps, head + np.array([0.0, y, 0.0]), albedo, ambient))
+            lit |= bool(lamps)
+    return automatic_exposure(spec.sensor, brightest, lit=lit, wavelength_nm=spec.wavelength_nm)
 
 
 def _refuse_change(_scene: Scene, name: str, _value: object) -> None:

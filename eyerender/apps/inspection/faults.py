@@ -11,6 +11,7 @@ KINDS = {
     "size": "the picture or a mask has another size than the window",
     "black": "the picture is black",
     "white": "the picture is white",
+    "contrast": "the pupil has no contrast to the iris",
     "flat": "the picture shows nothing: all of it has one level",
     "mask": "the mask is missing, cannot be read, or holds an unknown class",
     "mask and labels": "the mask shows other pixels of pupil or iris than the labels describe",

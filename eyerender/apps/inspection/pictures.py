@@ -26,6 +26,9 @@ _BLACK, _WHITE = 0.03, 0.97
 _MASK_PX = 0.01
 _LEAST_PX = 20
 _MEAN = f"{PICTURE}mean level"
+_SATURATED = f"{PICTURE}saturated (share)"
+# Share of saturated pixels of a picture that counts as white, and least contrast of a pupil that can be seen.
+_MOSTLY, _LEAST_CONTRAST = 0.5, 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,8 +71,13 @@ def measure(entry: ImageEntry) -> PictureSummary:
     faults += _blank(thumbnail)
     mask = _mask(entry, image.shape, faults)
     numbers = _levels(codes)
+    if (share := numbers[_SATURATED]) > _MOSTLY and not faults:
+        faults.append(Fault("white", f"{share:.0%} of it is saturated"))
     if mask is not None:
         numbers |= _levels_of_parts(codes, mask, numbers[_MEAN])
+        iris, pupil = (numbers.get(f"{PICTURE}level of the {part}", np.nan) for part in ("iris", "pupil"))
+        if abs(iris - pupil) < _LEAST_CONTRAST and not faults:
+            faults.append(Fault("contrast", f"iris and pupil differ by {abs(iris - pupil):.2%} of the full scale"))
     digest = hashlib.blake2b(np.ascontiguousarray(image).tobytes(), digest_size=8).digest()
     return PictureSummary(numbers=numbers, thumbnail=thumbnail, digest=digest, mask=mask, faults=faults)
 
@@ -116,7 +124,7 @@ def _levels(codes: Bytes) -> dict[str, float]:
     shares, levels = np.bincount(codes.ravel(), minlength=256) / codes.size, np.arange(256) / 255
     mean = float(shares @ levels)
     spread = float(np.sqrt(shares @ (levels - mean) ** 2))
-    return {_MEAN: mean, f"{PICTURE}spread of levels": spread, f"{PICTURE}saturated (share)": float(shares[255])}
+    return {_MEAN: mean, f"{PICTURE}spread of levels": spread, _SATURATED: float(shares[255])}
 
 
 def _levels_of_parts(codes: Bytes, mask: Bytes, mean: float) -> dict[str, float]:

@@ -426,7 +426,7 @@ class Tab:
         self._focal.enable(focal is not None)
         for knob, value in (
             (self._focal, focal),
-            (self._exposure, scene.spec.sensor.exposure_ms),
+            (self._exposure, scene.spec.sensor.time_ms),
             (self._aperture, scene.spec.sensor.f_number),
         ):
             if value is not None:

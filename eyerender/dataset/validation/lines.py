@@ -15,6 +15,7 @@ from ...base.errors import InputError
 from ...base.status import Status
 from ...base.storage.files import shown
 from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ...rig.plausibility import EXPOSURE_REMEDY
 from ...scene.observation import Observations
 from .problems import WRONG, FolderProblems
 from .shards import hashed
@@ -78,6 +79,9 @@ class Lines:
         expected = statistics.get("images") if isinstance(statistics, dict) else None
         if expected is not None and expected != len(entries):
             problems.add(f"{METADATA}: has {len(entries)} lines, {DATASET} says {expected}")
+        white = statistics.get("images_saturated") if isinstance(statistics, dict) else None
+        if isinstance(white, int) and white > len(entries) / 2:
+            problems.add(f"{DATASET}: {white} of {len(entries)} images are saturated; {EXPOSURE_REMEDY}")
         order = np.argsort(self._names, kind="stable")
         again = order[1:][self._names[order[1:]] == self._names[order[:-1]]]
         for k in np.sort(again):
