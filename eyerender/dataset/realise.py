@@ -266,6 +266,6 @@ def sample_line(
             "draws": sample.draws,
         },
         tree=sample.scene,
-        eye=sample.eye,
+        eye=sample.eye or None,
     )
     return image_name(turn.sample, frame, frames, side), line

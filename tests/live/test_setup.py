@@ -201,5 +201,5 @@ def test_the_gaze_error_is_that_of_a_regression_calibrated_on_the_present_rig(de
     assert "follow a target" in gaze_line(
         desk.looking(3, 4), calibrated(desk), er.trace(desk.looking(3, 4).frames()).take([0]), None
     )
-    head = setup_of("headset")
+    head = setup_of("head_mounted")
     assert "no screen" in gaze_line(head, calibrated(head), er.trace(head.frames()).take([0]), None)

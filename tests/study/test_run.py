@@ -305,8 +305,9 @@ def test_directions_of_the_head_mounted_rig():
     learnt = head_mounted.calibration_rows()
     assert learnt.sum() == 9
     # The shipped scene's own directions are those that are learnt.
-    own = load_scene("head_mounted").spec.poses
-    assert {(p.azimuth_deg, p.elevation_deg) for p in own} == {tuple(d) for d in head_mounted.directions_deg()[learnt]}
+    own = load_scene("head_mounted").frames().pose
+    shipped = np.round(np.degrees([own.azimuth_rad, own.elevation_rad]).T).astype(int) + 0
+    assert {tuple(d) for d in shipped.tolist()} == {tuple(d) for d in head_mounted.directions_deg()[learnt].tolist()}
 
 
 def test_directions_are_estimated_only_where_they_were_not_learnt():

@@ -42,7 +42,7 @@ class Item:
     def line(self) -> dict[str, Any]:
         """Metadata of the image; an image of a rendered folder counts as a sample of one subject, to train on."""
         line = self.entry.line
-        if line["sample"] is not None:
+        if line.get("sample", 0) is not None:
             return line
         number = line["records"][0]["frame"]
         own = {"sample": number, "split": UNSPLIT, "sequence_index": number, "subject": 0}
