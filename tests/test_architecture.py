@@ -230,7 +230,7 @@ BOUNDS = {
     "analytic": 730,
     "apps": 16300,
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
-    "base": 2340,
+    "base": 2440,  # one door for child processes and stored files; readings of YAML that are refused
     "cli": 2530,  # tables of features, targets and gaze from the command line
     "dataset": 9910,
     "design": 2810,

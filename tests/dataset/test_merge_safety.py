@@ -52,7 +52,7 @@ def write_done(folder, files):
 def taken(part, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    _take(out, [part], Plan(), lambda *_: None)
+    _take(out, [part], Plan(), lambda *_: None)  # type: ignore[arg-type]
     return {str(p.relative_to(out)): p for p in out.rglob("*") if not p.is_dir()}
 
 
@@ -116,7 +116,7 @@ def test_status_skips_events_with_impossible_numbers_and_shows_no_escapes(tmp_pa
     (tmp_path / "run.json").write_text(json.dumps(run), encoding="utf-8")
     (tmp_path / "shards/²").mkdir(parents=True)
     (tmp_path / "shards/²/done.json").write_text("{}", encoding="utf-8")
-    lines = "".join(json.dumps(EVENT | one) + "\n" for one in events)
+    lines = "".join(json.dumps(EVENT | one) + "\n" for one in events)  # type: ignore[operator]
     (tmp_path / "log.jsonl").write_text(lines, encoding="utf-8")
     found = status(tmp_path)
     json.dumps(found, allow_nan=False)
