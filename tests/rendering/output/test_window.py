@@ -35,7 +35,7 @@ def shot(renderer, **more):
                 },
                 "poses": [{"azimuth_deg": 0, "elevation_deg": 0}],
                 "image": {"spp": 8, "window_px": [160, 160]},
-                "sensor": {"noise": False, "pixel_pitch_um": 5.0, "f_number": 4.0},
+                "sensor": {"noise": False, "pixel_pitch_um": 5.0, "f_number": 4.0, "exposure_ms": 15},
                 **more,
             }
         )

@@ -143,8 +143,8 @@ def test_a_folder_says_its_classes_and_its_gamma(tmp_path):
 
 
 def test_jpeg_changes_codes_but_not_the_noiseless_ones(renderer):
-    plain = picture(renderer, sensor={"bit_depth": 8})
-    coarse = picture(renderer, sensor={"bit_depth": 8, "jpeg_quality": 20})
+    plain = picture(renderer, sensor={"bit_depth": 8, "exposure_ms": 15})
+    coarse = picture(renderer, sensor={"bit_depth": 8, "jpeg_quality": 20, "exposure_ms": 15})
     assert not np.array_equal(plain.counts, coarse.counts)
     assert np.abs(plain.counts.astype(int) - coarse.counts).mean() < 3
     assert np.array_equal(noiseless(plain), noiseless(coarse))
