@@ -284,7 +284,10 @@ class PackedLines:
             return self.given
         assert self.file is not None
         path = inside(self.folder, self.file.name)
-        rows = mapped_array(path)
+        try:
+            rows = mapped_array(path)
+        except InputError as error:
+            raise InputError(f"is not an index of images ({error.reason})", source=str(path)) from None
         if rows.dtype != INDEX_TYPE or rows.ndim != 1:
             raise InputError("is not an index of images", source=str(path))
         return rows
