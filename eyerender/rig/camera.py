@@ -42,6 +42,12 @@ def _distinct(eyes: tuple[Side, ...]) -> tuple[Side, ...]:
 
 EyeNames = Annotated[tuple[Side, ...], Field(min_length=1, max_length=2), AfterValidator(_distinct)]
 
+
+def serves(eyes: Sequence[str] | None, side: str) -> bool:
+    """Return whether a camera or an LED with these `eyes` (None: both) serves an eye, right or left."""
+    return eyes is None or side in eyes
+
+
 _PLACE = {"position_mm", "look_at_mm", "pan_deg", "tilt_deg"}
 _LENS = {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"}
 # The columns are the camera's right, down and forward axes at rest, in the world (x to the screen, y left, z up).
@@ -346,7 +352,7 @@ class PinholeCamera(ArrayValue):
 
     def sees(self, side: str) -> bool:
         """Return whether the camera sees an eye, right or left."""
-        return self.eyes is None or side in self.eyes
+        return serves(self.eyes, side)
 
     @property
     def across(self) -> float:

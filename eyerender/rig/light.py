@@ -14,7 +14,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.spec import EYES, NonNegative, Number, Positive, Side, Spec, Vec3
-from .camera import EyeNames, PinholeCamera
+from .camera import EyeNames, PinholeCamera, serves
 
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
 # frame.
@@ -154,7 +154,7 @@ class Lamp(ArrayValue):
 
     def lights(self, eye: int) -> bool:
         """Return whether the LED lights an eye: 0 right, 1 left, -1 unknown (then yes)."""
-        return self.eyes is None or eye < 0 or EYES[eye] in self.eyes
+        return eye < 0 or serves(self.eyes, EYES[eye])
 
     def towards(self, point_mm: Floats) -> tuple[float, float, float]:
         """Compute the radiant intensity I cos^m (mW/sr) towards a point (3,), this cosine, and the distance (mm)."""

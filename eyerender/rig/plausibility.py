@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import Floats
 from ..base.errors import InputWarning
-from .camera import Camera, PinholeCamera, Window
+from .camera import Camera, PinholeCamera, Window, serves
 from .light import Lamp
 from .rig import RigGeometry
 from .screen import ScreenPlane
@@ -263,7 +263,7 @@ def _misplaced(
 
 def _served(eyes_mm: Mapping[str, Floats], eyes: Sequence[str] | None) -> dict[str, Floats]:
     """Return the apexes of the eyes that a camera sees or a lamp lights; their names begin with the side."""
-    return {name: eye for name, eye in eyes_mm.items() if eyes is None or name.split()[0] in eyes}
+    return {name: eye for name, eye in eyes_mm.items() if serves(eyes, name.split()[0])}
 
 
 def _unaimed(lamp: Lamp, eyes_mm: Mapping[str, Floats]) -> str | None:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from ..base.arrays import ArrayValue, Bools, Ints
 from ..base.errors import InputError
 from ..base.spec import Side, Spec
-from .camera import Camera, PinholeCamera
+from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import Mount
 from .screen import Screen, ScreenPlane
@@ -118,8 +118,8 @@ class Rig(Spec):
         """
         if not any([camera.eyes for camera in self.cameras] + [led.eyes for led in self.lights]):
             return self
-        cameras = [camera for camera in self.cameras if camera.eyes is None or side in camera.eyes]
-        leds = [led for led in self._single_leds(0) if side in (led.get("eyes") or (side,))]
+        cameras = [camera for camera in self.cameras if serves(camera.eyes, side)]
+        leds = [led for led in self._single_leds(0) if serves(led.get("eyes"), side)]
         for name, kept, verb in (("cameras", cameras, "sees"), ("lights", leds, "lights")):
             if not kept:
                 raise InputError(f"none {verb} the {side} eye", path=f"rig.{name}")

@@ -19,11 +19,11 @@ from ..eye.spec import EyeSpec
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
-from ..rig.camera import EyeNames
+from ..rig.camera import EyeNames, serves
 from ..rig.imaging import Ambient, Lens, Motion, Picture
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
-from .observation import EYES, MAX_GLINTS
+from .observation import MAX_GLINTS
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -300,7 +300,7 @@ class SceneSpec(FileSpec):
         else:
             fixations = len(targets.screen_mm or targets.world_mm or ())
         heads, cameras, eyes = len(self.subject.head_positions_mm), len(self.rig.cameras), len(self.subject.eyes)
-        views = sum(side in (camera.eyes or EYES) for camera in self.rig.cameras for side in self.subject.eyes)
+        views = sum(serves(camera.eyes, side) for camera in self.rig.cameras for side in self.subject.eyes)
         if views == 0:
             raise KeyProblem("rig.cameras", f"none sees the {' or the '.join(self.subject.eyes)} eye of `subject.eyes`")
         count = fixations * heads * views
