@@ -541,7 +541,7 @@ class Scene:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames: one for each head position, fixation and camera, whether it sees an observed eye or not."""
+        """How many frames there are, one for each head position, fixation and camera, whether it sees an eye or not."""
         fixations = len(self.spec.poses or ()) if self.targets_mm is None else len(self.targets_mm)
         return len(self.spec.subject.head_positions_mm) * fixations * len(self.rig.cameras)
 
