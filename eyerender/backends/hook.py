@@ -10,8 +10,6 @@ import sys
 from collections.abc import Callable
 from importlib.abc import MetaPathFinder
 
-from .libraries import is_testing
-
 
 class DrjitHook(MetaPathFinder):
     """Prepare the process when drjit is about to be imported; the usual finders then import it."""
@@ -20,8 +18,7 @@ class DrjitHook(MetaPathFinder):
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> None:
         """Prepare the process once; find nothing."""
-        # A process that tests one library keeps it; preparing would start such processes without end.
-        if fullname == "drjit" and self.prepare and not is_testing():
+        if fullname == "drjit" and self.prepare:
             prepare, self.prepare = self.prepare, None
             prepare()
 

@@ -16,18 +16,6 @@ RUNTIME = {"libatomic.so.1": ("libatomic1", "libatomic")} if sys.platform == "li
 # Python starts, but only in a writable environment, so they are loaded by their real names.
 _BESIDE_LLVM = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
-_TESTED: list[Path | None] = []
-
-
-def begin_test(library: Path | None) -> None:
-    """Let this process keep a library that it tests (None: whichever Dr.Jit finds), also if it does not render."""
-    _TESTED.append(library)
-
-
-def is_testing() -> bool:
-    """Return whether this process tests one library."""
-    return bool(_TESTED)
-
 
 def runtime_store() -> Path | None:
     """Return the folder of the libraries that `setup_llvm` fetched; None without a private cache folder."""

@@ -29,7 +29,8 @@ from ..base.processes import python_command, run
 from ..base.storage.cachefolder import cache_folder
 from ..base.storage.files import read_json, write_json
 from ..base.versions import package_version
-from .libraries import begin_test, load_llvm, load_runtime
+from .hook import HOOK
+from .libraries import load_llvm, load_runtime
 
 TIMEOUT_S = 180.0
 REFUSAL_AGE_S = 86400.0  # a failure is tested again after a day, because the GPU may have been busy or memory short
@@ -215,7 +216,7 @@ def main(arguments: Sequence[str]) -> int:
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         library = Path(arguments[1]) if len(arguments) > 1 else None
         lasting = False  # a library that does not load may lack something that is installed later
-        begin_test(library)
+        HOOK.prepare = None  # this process keeps what it tests; preparing would start such processes without end
         load_runtime()
         if library:
             load_llvm(library)
