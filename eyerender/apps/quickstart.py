@@ -6,10 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ..backends.choose import BackendChoice
-from ..base.arrays import Ints
 from ..base.errors import Warn
 from ..base.progress import Progress, notify
 from ..folders.imagefolder import ImageFolder, same_run
@@ -88,7 +85,7 @@ def run_quickstart(
     if warn is not None:
         saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
         warn(saturation_warnings(saturated, len(images.entries), loaded.source))
-    result = _compared(images, [loaded.rig] * len(images), Regression(), "", step(count, "extracting"))
+    result = _compared(images, [loaded.rig] * len(loaded.index()), Regression(), "", step(count, "extracting"))
     timings.append(Timing("extracting and calibrating", time.monotonic() - start))
     write_report(folder / REPORT, loaded, result, images.entries, timings)
     notify(progress, 2 * count + 1, 2 * count + 1, "done")
@@ -120,12 +117,5 @@ def _compared(
 ) -> Comparison:
     truth = images.truth()
     found = ImageObserver().observe_entries(images.entries, truth.index, rigs, progress=progress)
-    own = [rig for entry, rig in zip(images, rigs, strict=True) for _ in entry.records]
-    return compare(truth, found, own, estimator, name, subjects=_subjects(images))
-
-
-def _subjects(images: ImageFolder) -> Ints | None:
-    """Return the subject of each record of a dataset; None for a rendered folder."""
-    if images.dataset.get("kind") != "dataset":
-        return None
-    return np.array([int(entry.line["subject"]) for entry in images for _ in entry.records], dtype=np.int64)
+    subjects = truth.index.subject
+    return compare(truth, found, rigs, estimator, name, subjects=subjects if (subjects >= 0).all() else None)

@@ -118,11 +118,11 @@ def extract(
     if is_video(images[0]):
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))
-        VideoReader(images[0])  # which refuses what is no video, before any warning
+        video = VideoReader(images[0])  # which refuses what is no video, before any warning
         heed(_gamma_warnings(gamma, images[0]))
         with progress("extracting") as steps:
             files = VideoOutput(output, overlay)
-            result = observe_video(images[0], observer, files, scene=loaded, eyes=eyes, progress=steps, warn=heed)
+            result = observe_video(video, observer, files, scene=loaded, eyes=eyes, progress=steps, warn=heed)
         emit(result.to_mapping(), result.to_text(), json, heed)
         return 0
     if overlay is not None:
@@ -153,11 +153,11 @@ def _settings(radius_px: tuple[float, float] | None, min_confidence: float | Non
 
     low, high = radius_px or (None, None)
     numbers = {"radius_min_px": low, "radius_max_px": high, "min_confidence": min_confidence}
-    options = {"radius_min_px": "--radius-px", "radius_max_px": "--radius-px", "min_confidence": "--min-confidence"}
     try:
         return ExtractionSettings.from_mapping(given | {k: v for k, v in numbers.items() if v is not None})
     except InputError as error:
-        raise InputError(error.reason, source=options.get(error.path, "--radius-px")) from None
+        option = "--min-confidence" if error.path == "min_confidence" else "--radius-px"
+        raise InputError(error.reason, source=option) from None
 
 
 def _check_extract(images: Sequence[Path], gamma: float | None, eyes: int) -> None:

@@ -30,14 +30,22 @@ from ..folders.imagefolder import METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..scene import Frames, Scene
-from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
+from ..scene.observation import (
+    EYES,
+    GlintFeatures,
+    Index,
+    Observations,
+    PoseTruth,
+    PupilFeatures,
+    concatenate,
+)
 from .capture import EyeImage, render_windows
 
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.
 _PLACE_MM = 1.5
-_BATCH = 256
 # A process takes 1 to 1.5 s to start; two processes gain that after 100 to 150 images of 20 ms each.
 LEAST_FOR_POOL = 128
+_BATCH = 256  # of observations that are joined at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,8 +94,9 @@ class ImageObserver:
         self, folder: ImageFolder, scene: Scene | None = None, *, progress: Progress | None = None
     ) -> Observations:
         """Extract the features of a folder's images, in the order of its records; `scene` replaces their rigs."""
-        rigs = rigs_of(folder) if scene is None else [scene.rig] * len(folder.entries)
-        return self.observe_entries(folder.entries, folder.truth().index, rigs, progress=progress)
+        index = folder.truth().index
+        rigs = rigs_of(folder) if scene is None else [scene.rig] * len(index)
+        return self.observe_entries(folder.entries, index, rigs, progress=progress)
 
     def observe_entries(
         self,
@@ -98,25 +107,20 @@ class ImageObserver:
         progress: Progress | None = None,
         exposed: Callable[[NDArray[Any], ImageEntry], NDArray[Any]] | None = None,
     ) -> Observations:
-        """Extract the features of images with a rig for each; `index` has a row for each of their records.
+        """Extract the features of images; `index` has a row, and `rigs` an entry, for each of their records.
 
         `exposed` converts each image before extraction, for instance to another exposure.
         """
-        parts: list[Observations] = []
-        few: list[Observations] = []  # single observations take ten times the memory of joined ones
-        row = 0
-        for entry, rig in zip(followed(entries, progress), rigs, strict=True):
+        found, row = Gathering(), 0
+        for entry in followed(entries, progress):
             if len(entry.records) == 0:
                 raise InputError("has no records", source=str(entry.path))
             image = entry.image() if exposed is None else exposed(entry.image(), entry)
             rows = np.arange(row, row + len(entry.records))
             depth = int(entry.line.get("bit_depth") or 8 * image.itemsize)
-            few.append(self._observe_rows(image, depth, entry.window[:2], index, rows, rig, entry.gamma))
-            if len(few) == _BATCH:
-                parts.append(concatenate(few))
-                few = []
+            found.add(self._observe_rows(image, depth, entry.window[:2], index, rows, rigs[row], entry.gamma))
             row = int(rows[-1]) + 1
-        return concatenate([*parts, *few])
+        return found.all()
 
     def observe_files(
         self,
@@ -151,7 +155,7 @@ class ImageObserver:
         paths = files_of(paths)
         if pictures is not None:
             _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
-        parts, skipped, coloured = [], [], 0
+        gathered, skipped, coloured = Gathering(), list[InputWarning](), 0
         job = _FileJob(settings=self.settings, gamma=self.gamma, eyes=eyes, pictures=pictures, lenient=lenient)
         count = processes if len(paths) >= LEAST_FOR_POOL else 1
         with mapper(count, initializer=single_threaded, chunksize=4) as each:
@@ -160,7 +164,7 @@ class ImageObserver:
                     if isinstance(done, InputError):
                         raise done
                     found, shape, colour = done
-                    parts.append(self.observe_found(found, k, shape, scene=scene, source=str(paths[k])))
+                    gathered.add(self.observe_found(found, k, shape, scene=scene, source=str(paths[k])))
                     coloured += colour
                 except InputError as error:
                     if not lenient:
@@ -170,9 +174,9 @@ class ImageObserver:
                     )
         if warn is not None:
             warn([*skipped, *([colour_warning(coloured, "images" if coloured > 1 else "image")] if coloured else [])])
-        if not parts:
+        if len(skipped) == len(paths):
             raise InputError(f"holds no image that can be used ({skipped[0].reason})", source=skipped[0].source)
-        return concatenate(parts)
+        return gathered.all()
 
     def observe_found(
         self,
@@ -277,6 +281,25 @@ def _picture_of(path: str | Path, folder: Path) -> Path:
     return folder / f"{Path(path).stem}.png"
 
 
+class Gathering:
+    """Observations that come one by one, joined in batches: single ones take ten times the memory of joined ones."""
+
+    def __init__(self) -> None:
+        self._joined: list[Observations] = []
+        self._single: list[Observations] = []
+
+    def add(self, one: Observations) -> None:
+        """Add observations after those so far."""
+        self._single.append(one)
+        if len(self._single) == _BATCH:
+            self._joined.append(concatenate(self._single))
+            self._single = []
+
+    def all(self) -> Observations:
+        """Return what was added, in order; there must be something."""
+        return concatenate([*self._joined, *self._single])
+
+
 def _refuse_inputs(pictures: Sequence[Path], paths: Sequence[str | Path]) -> None:
     """Check that no output picture is one of the input images."""
     inputs = set()
@@ -322,7 +345,7 @@ def detect(
 
 
 def rigs_of(folder: ImageFolder) -> list[RigGeometry]:
-    """Return the rig that took each image of a folder, in order; equal rigs, but for their power, are one object.
+    """Return the rig of each record of a folder, in order; equal rigs, but for their power, are one object.
 
     Raises:
         InputError: an image's scene is missing or wrong.
@@ -341,7 +364,7 @@ def rigs_of(folder: ImageFolder) -> list[RigGeometry]:
             raise InputError("has no parameters", source=source) from None
         if key not in found:
             found[key] = Rig.from_mapping(rig, source=source).resolved().build()
-        rigs.append(found[key])
+        rigs += [found[key]] * len(entry.records)
     return rigs
 
 

@@ -17,8 +17,7 @@ from ..extraction.video import VideoReader, VideoWriter, follow
 from ..gaze.records import is_table
 from ..gaze.table import features_csv
 from ..scene import Scene
-from ..scene.observation import Observations, concatenate
-from .imageobserver import ImageObserver, colour_warning, lights_of
+from .imageobserver import Gathering, ImageObserver, colour_warning, lights_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +57,7 @@ class VideoOutput:
 
 
 def observe_video(
-    path: Path,
+    video: VideoReader,
     observer: ImageObserver,
     output: VideoOutput = VideoOutput(),
     *,
@@ -70,7 +69,7 @@ def observe_video(
     """Extract the features of a video's frames.
 
     Args:
-        path: the video.
+        video: the video, of which nothing has been read.
         observer: the image observer, with its settings and gamma.
         output: files to write.
         scene: the scene whose rig took the video.
@@ -78,36 +77,35 @@ def observe_video(
         progress: called after each frame.
         warn: receives a warning if frames have colour.
     """
-    reader = VideoReader(path)
     count = pupils = ok = coloured = 0
     with ExitStack() as stack:
         file = None if output.records is None else stack.enter_context(written(output.records, sync=False))
         table = output.records is not None and is_table(output.records)
-        parts: list[Observations] = []
+        gathered = Gathering()
         writer: VideoWriter | None = None
-        for frame, found in follow(reader, gamma=observer.gamma, settings=observer.settings, eyes=eyes):
+        for frame, found in follow(video, gamma=observer.gamma, settings=observer.settings, eyes=eyes):
             if output.overlay is not None:
                 if writer is None:
                     height, width = frame.image.shape
-                    writer = stack.enter_context(VideoWriter(output.overlay, width, height, reader.frames_per_s))
+                    writer = stack.enter_context(VideoWriter(output.overlay, width, height, video.frames_per_s))
                 writer.add(drawn(frame.image, found, 255.0))
             time_s = frame.time_s if math.isfinite(frame.time_s) else math.nan
             seen = observer.observe_found(
-                found, frame.number, frame.image.shape, scene=scene, source=str(path), time_s=time_s
+                found, frame.number, frame.image.shape, scene=scene, source=video.source, time_s=time_s
             )
             if table:
-                parts.append(seen)
+                gathered.add(seen)
             elif file is not None:
                 file.writelines(json.dumps(one, allow_nan=False).encode() + b"\n" for one in seen.records())
             count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
             ok += sum(one.pupil.ok for one in found)
-            notify(progress, count, max(reader.count, count), "")
+            notify(progress, count, max(video.count, count), "")
         if file is not None and table:
-            file.write(features_csv(concatenate(parts), lights_of(scene)).encode())
+            file.write(features_csv(gathered.all(), lights_of(scene)).encode())
     if coloured and warn is not None:
         warn([colour_warning(coloured, "frames")])
     return VideoSummary(
-        source=str(path),
+        source=video.source,
         frames=count,
         pupils=pupils,
         found=ok,

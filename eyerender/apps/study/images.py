@@ -80,8 +80,8 @@ class StudyImages:
             return expose_again(scene.spec.sensor, codes, seed, entry.window[:2])
 
         again = None if noise_seed is None else exposed
-        entries = self.of(scene)
-        return ImageObserver().observe_entries(entries, scene.index(), [scene.rig] * len(entries), exposed=again)
+        index = scene.index()
+        return ImageObserver().observe_entries(self.of(scene), index, [scene.rig] * len(index), exposed=again)
 
 
 def shots(scene: Scene, *, noise: bool, facing: bool = False, spp: int | None = None) -> list[EyeShot]:
