@@ -48,7 +48,9 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
         raise InputError(f"is {shown(other)}; this version reads format {known}", source=str(file), path="format")
     below = extended(below, file_of, folder, depth + 1)
     own = {key: value for key, value in data.items() if key != EXTENDS}
-    found: dict[str, Any] = _merged({k: v for k, v in below.items() if not (k == "splits" and k in own)}, own)
+    if "splits" in own:
+        below.pop("splits", None)
+    found: dict[str, Any] = _merged(below, own)
     return found
 
 

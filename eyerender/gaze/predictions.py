@@ -57,6 +57,7 @@ def predictions(
         place, source = _eye_places(estimator, observations, rig)
         errors = {"deg": angular_error_deg(gaze.point_mm, index.target_mm, place)}
         errors |= _screen_errors(observations, gaze.point_mm, rig.screen, screen_px)
+        angles = _screen_angles(gaze.point_mm, place, rig.screen)
     single = [
         {
             **_identity(observations, i),
@@ -66,13 +67,11 @@ def predictions(
             "target_mm": _numbers(index.target_mm[i]),
             **_errors_of(errors, i),
             "eye_place": source[i],
+            "angle_deg": _numbers(angles[i]),
         }
         for i in range(len(observations))
     ]
     summary = _by_eye(observations, gaze.ok, errors, source)
-    angles = _screen_angles(gaze.point_mm, place, rig.screen)
-    for entry, angle in zip(single, angles, strict=True):
-        entry["angle_deg"] = _numbers(angle)
     binocular: list[dict[str, Any]] = []
     if len(np.unique(index.eye[index.eye >= 0])) == 2:
         frames, both = binocular_average(observations, gaze)

@@ -67,7 +67,7 @@ def _misfits(angles: Floats, places: Floats, pupils: Floats) -> list[tuple[int, 
     # The median of 70 % of the squared distances is that of 35 % of all; for Gaussian errors in two dimensions this is
     # sigma^2 * 0.86.
     deviation = float(np.sqrt(np.quantile(best**2, _SHARE / 2) / 0.86))
-    kept = best <= np.sort(best)[trimmed - 1]
+    kept = _nearest(best, trimmed)
     travel = float(np.ptp(pupils[kept & np.isfinite(pupils).all(axis=1)], axis=0).max(initial=0.0))
     limit = max(_DEVIATIONS * deviation, _LEAST_PX, _TRAVEL[design.shape[1]] * travel)
     return [(int(row), float(best[row])) for row in np.flatnonzero(best > limit)]
@@ -86,14 +86,19 @@ def _trimmed_misses(design: Floats, places: Floats, trimmed: int) -> Floats:
     size = design.shape[1] + 1
     best, least = np.zeros(len(places)), np.inf
     for _ in range(_STARTS):
-        rows: Ints | Bools = rng.choice(len(places), size, replace=False)
+        misses = _misses(design, places, rng.choice(len(places), size, replace=False))
         for _ in range(_STEPS):
+            rows = _nearest(misses, trimmed)
             misses = _misses(design, places, rows)
-            rows = misses <= np.partition(misses, trimmed - 1)[trimmed - 1]
-        total = float((_misses(design, places, rows)[rows] ** 2).sum())
+        total = float((misses[rows] ** 2).sum())
         if total < least:
-            best, least = _misses(design, places, rows), total
+            best, least = misses, total
     return best
+
+
+def _nearest(misses: Floats, count: int) -> Bools:
+    """Return which of the distances (n,) are among the `count` smallest."""
+    return np.asarray(misses <= np.partition(misses, count - 1)[count - 1])
 
 
 def _misses(design: Floats, places: Floats, rows: Ints | Bools) -> Floats:
