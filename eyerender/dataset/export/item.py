@@ -216,13 +216,21 @@ class Items:
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
+        without: LinePlace | None = None  # the first line that names no sample
+        count_of_samples = 0
         for row, own in enumerate(self._each(_surveyed)):
             samples[row], names[row] = own.sample, hash(own.name)
+            without = without or (None if own.is_of_sample else self.place)
+            count_of_samples += own.is_of_sample
             splits[own.split] += 1
             self.bit_depths.add(own.bit_depth)
             self.sizes.add(own.size)
             self.lights = max(self.lights, own.lights)
             self.file_name_bytes = max(self.file_name_bytes, own.file_name_bytes)
+        if without is not None and count_of_samples:
+            raise InputError(
+                "is null, but other images name theirs", source=str(without[0]), path=f"line {without[1]}.sample"
+            )
         if len(np.unique(names)) < len(names):
             raise InputError("two images have the same file name", source=str(self.folder.path / METADATA))
         # Images of one sample keep their order in both cases.
@@ -316,6 +324,7 @@ class _Surveyed:
     """What must be known of an image before the first one is written."""
 
     sample: int
+    is_of_sample: bool
     name: str
     split: str
     bit_depth: int
@@ -327,6 +336,7 @@ class _Surveyed:
 def _surveyed(item: Item) -> _Surveyed:
     return _Surveyed(
         sample=item.line["sample"],
+        is_of_sample=item.entry.line["sample"] is not None,
         name=item.name,
         split=item.split,
         bit_depth=item.bit_depth,
