@@ -45,7 +45,19 @@ FLOORS = {
 # The order of the packages that share a floor and use each other: each may import those before it.
 ORDER = ["population", "scene"]
 # The modules of `base`: each may import those before it.
-BASE = ["errors", "arrays", "progress", "processes", "status", "storage", "jit", "references", "spec", "versions"]
+BASE = [
+    "errors",
+    "arrays",
+    "progress",
+    "processes",
+    "status",
+    "storage",
+    "arguments",
+    "jit",
+    "references",
+    "spec",
+    "versions",
+]
 # The sub-packages of the renderer: each may import those before it, and `renderer` all of them.
 RENDERING = ["records", "scene", "materials", "hits", "transport", "glints", "integrator", "output", "renderer"]
 
@@ -230,7 +242,7 @@ BOUNDS = {
     "analytic": 730,
     "apps": 16300,
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
-    "base": 2440,  # one door for child processes and stored files; readings of YAML that are refused
+    "base": 2530,  # one door for child processes and stored files; arguments of public functions checked, for all users
     "cli": 2530,  # tables of features, targets and gaze from the command line
     "dataset": 9910,
     "design": 2810,
@@ -245,7 +257,7 @@ BOUNDS = {
     "rendering": 12520,
     "report": 970,
     "rig": 3130,  # cameras and LEDs that serve one eye: headsets; exposure set by the lights
-    "scene": 2150,  # instants, people and times in records
+    "scene": 2160,  # instants, people and times in records; names and lengths that are refused where they are written
 }
 
 

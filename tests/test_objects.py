@@ -256,8 +256,10 @@ def test_what_cannot_be_changed_says_what_to_do():
 
 @pytest.mark.parametrize("function", [er.trace, er.render, lambda x: next(er.render_windows(x))])
 def test_frames_or_a_scene_are_wanted(function):
-    with pytest.raises(TypeError, match="give frames or a scene, not int"):
+    with pytest.raises(er.InputError, match=r"frames: must be .* or .*Source, not 3"):
         function(3)
+    with pytest.raises(TypeError, match="give frames or a scene, not Rig"):
+        function(RIG)
 
 
 def test_windows_of_a_scene_are_those_of_its_frames(monkeypatch):

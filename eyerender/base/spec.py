@@ -452,6 +452,8 @@ def _described(problem: Mapping[str, Any], path: str) -> tuple[str, str]:
         cause = context.get("error", problem["msg"])
         inner = cause.path if isinstance(cause, KeyProblem) else ""
         return ".".join(filter(None, (path, inner))), str(cause)
+    if kind in ("tuple_type", "list_type"):
+        return path, f"must be a list, not {shown(problem['input'])}"
     message = problem["msg"]
     message = message.replace("Input should be", "must be")
     value = problem.get("input")

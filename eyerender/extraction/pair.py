@@ -28,7 +28,7 @@ def extract_eyes(
     """
     array = np.asarray(image)
     if array.ndim < 2 or array.shape[1] < LEAST_WIDTH:
-        one = extract(image, bit_depth=bit_depth, gamma=gamma, settings=settings)
+        one = extract(array, bit_depth=bit_depth, gamma=gamma, settings=settings)
         return one, replace(one, pupil=PupilResult.missing("input", "the image is too narrow for two eyes"), glints=())
     width = array.shape[1]
     begins = (0, int((0.5 - OVERLAP) * width))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.arrays import Bools, Floats
 from ..base.jit import ensure_compiled
@@ -40,7 +42,7 @@ SAME_LIGHT = 0.5  # noise standard deviations; a smaller change of the spots' li
 
 
 def extract(
-    image: object,
+    image: NDArray[Any],
     *,
     bit_depth: int | None = None,
     gamma: float = 1.0,

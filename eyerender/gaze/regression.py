@@ -17,8 +17,9 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints, Objects
-from ..base.errors import InputError
+from ..base.errors import InputError, nearest
 from ..base.spec import Spec
+from ..base.storage.files import shown
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
 from .builtin import BuiltIn, EstimatorOptions
@@ -96,6 +97,14 @@ class PolynomialEstimator(BuiltIn):
     function: str | tuple[str, str]
     fits: Mapping[int, PolynomialFit]
 
+    def __post_init__(self) -> None:
+        """Check the function where it is written.
+
+        Raises:
+            InputError: there is no such function.
+        """
+        _ = self.terms
+
     @property
     def terms(self) -> tuple[Terms, Terms]:
         """Exponents of the terms of both polynomials.
@@ -105,7 +114,8 @@ class PolynomialEstimator(BuiltIn):
         """
         if isinstance(self.function, str):
             if self.function not in FUNCTIONS:
-                raise InputError(f"{self.function!r} is not a regression function (R1 to R12)")
+                near = nearest(self.function, FUNCTIONS)
+                raise InputError(f"{shown(self.function)} is not a regression function; {near}there are R1 to R12")
             x, y = FUNCTIONS[self.function]
         else:
             x, y = self.function

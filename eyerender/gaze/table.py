@@ -21,7 +21,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Ints, Objects, frozen
 from ..base.errors import InputError, Problems
 from ..base.status import Status
-from ..base.storage.files import csv_text, read_bytes, shown
+from ..base.storage.files import csv_text, read_text, shown
 from ..rig.light import MAX_LIGHTS
 from ..rig.rig import RigLike
 from ..rig.screen import ScreenPlane
@@ -100,10 +100,7 @@ class _Table:
     @classmethod
     def read(cls, path: str | Path, delimiter: str | None) -> _Table:
         source = str(path)
-        try:
-            text = read_bytes(path, limit=MAX_TABLE_BYTES).decode("utf-8-sig")
-        except UnicodeDecodeError:
-            raise InputError("cannot be read (not UTF-8 text)", source=source) from None
+        text = read_text(path, limit=MAX_TABLE_BYTES).removeprefix("\ufeff")
         delimiter = delimiter or max(",;\t", key=text.split("\n", 1)[0].count)
         problems = Problems(source)
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)

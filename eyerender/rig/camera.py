@@ -20,15 +20,24 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.errors import InputError
 from ..base.spec import Number, Positive, Side, Spec, Vec2, Vec3
+from ..base.storage.files import shown
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
-Distortion = tuple[Number, Number, Number, Number, Number]
+
+
+def _five(value: object) -> object:
+    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 5:
+        raise ValueError(f"must be the five numbers [k1, k2, p1, p2, k3], not {shown(value)}")
+    return tuple(value)
+
+
+Distortion = Annotated[tuple[Number, Number, Number, Number, Number], BeforeValidator(_five)]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
 Window = tuple[int, int, int, int]
 """A part of a sensor: its first column and row, its width and its height (px)."""

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -172,6 +173,8 @@ class Scene:
         """
         given = {key: value for key, value in {"subject": subject, "rig": rig, **fields}.items() if value is not None}
         made = Scene.of(SceneSpec(name=name, **given))
+        for warning in length_warnings(made.spec.to_mapping()):
+            warnings.warn(f"{warning.path}: {warning.reason}", stacklevel=2)
         for name in made.__slots__:
             object.__setattr__(self, name, getattr(made, name))
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from ..base.errors import InputError
 from ..base.spec import FileSpec, KeyProblem, Positive, Side, Spec, Vec2, Vec3
-from ..eye.catalogue import load_eye
+from ..eye.catalogue import load_eye, refuse_unknown
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.spec import EyeSpec
@@ -62,6 +62,14 @@ class Eye(Spec):
         "entrance window (Aguirre 2019)",
     )
     margin: PupilMargin | None = Field(default=None, description="boundary of the pupil; default: the eye file's")
+
+    @field_validator("model")
+    @classmethod
+    def _known(cls, model: str | EyeSpec) -> str | EyeSpec:
+        """Refuse a name that is neither in the catalogue nor that of a file."""
+        if isinstance(model, str) and not model.endswith((".yaml", ".yml")):
+            refuse_unknown(model)
+        return model
 
     @classmethod
     def load(cls, model: str | EyeSpec, **fields: Any) -> Self:

@@ -242,7 +242,7 @@ def test_calibrations_without_a_rig_are_read_and_older_files_get_one_line(guestr
     assert run(["gaze", "predict", str(guestrin), "-c", str(tmp_path / "c.json"), "--strict"]) == 0
     data["rig"] = {"cameras": 1}
     (tmp_path / "c.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=r"rig\.cameras: must be a valid array"):
+    with pytest.raises(InputError, match=r"rig\.cameras: must be a list"):
         load_calibration(tmp_path / "c.json")
 
 
@@ -315,7 +315,7 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
         ("eyes.right.a", [[1.0]] * 6, "eyes.right.a.0: must be a valid number"),
         ("eyes.left.scale", [0.0, 1.0], "eyes.left.scale.0: must be > 0"),
         ("eyes.left.origin", ["0", 1.0], "eyes.left.origin.0: must be a valid number"),
-        ("eyes.left.b", None, "eyes.left.b: must be a valid array"),
+        ("eyes.left.b", None, "eyes.left.b: must be a list"),
     ],
 )
 def test_a_calibration_of_another_shape_is_refused(guestrin, tmp_path, path, value, words):
@@ -345,7 +345,7 @@ def test_a_calibration_of_another_shape_is_refused(guestrin, tmp_path, path, val
         ("cameras.0.t", [[1], [2, 3], 4], "rig.cameras.0.t.0: must be a valid number"),
         ("cameras.0.resolution_px", [1e300, 1], "rig.cameras.0.resolution_px"),
         ("cameras.0.resolution_px", [1.5, 1], "rig.cameras.0.resolution_px.0: must be a valid integer"),
-        ("lights_mm", 3, "rig.lights_mm: must be a valid array"),
+        ("lights_mm", 3, "rig.lights_mm: must be a list"),
         ("lights_mm", [[0, 0, 0]] * 1001, "rig.lights_mm: needs at most 1000 entries"),
         ("screen", "wide", "rig.screen: must be an object"),
         ("screen.size_mm", [0, 1], "rig.screen.size_mm.0: must be > 0"),

@@ -198,7 +198,7 @@ def test_a_scene_names_a_calibration_file(tmp_path, monkeypatch, capsys):
         ({"calibration": {"file": ""}}, "rig.cameras.0.calibration.file: "),
         ({"calibration": {"file": "camera.yml", "unit_mm": 0}}, "rig.cameras.0.calibration.unit_mm: must be > 0"),
         ({"calibration": {"file": "camera.yml", "K": 1}}, "rig.cameras.0.calibration.K: unknown key"),
-        ({"calibration": {"K": 1}}, "rig.cameras.0.calibration.K: must be a valid array"),
+        ({"calibration": {"K": 1}}, "rig.cameras.0.calibration.K: must be a list"),
         (
             {"resolution_px": [320, 240]},
             "camera.yml: is for (640, 480) px, but resolution_px of the camera is",

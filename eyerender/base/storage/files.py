@@ -15,6 +15,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,7 @@ PART = ".part"
 _TO_ZEROS = bytes.maketrans(b"123456789E", b"000000000e")
 _LONG = (b"0" * 200, b"e000", b"e+000")
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{1,30}):/+")  # a single letter is a drive
+_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # .xlsx, .xls
 _PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
 
 
@@ -177,6 +179,22 @@ def make_folder(path: str | Path) -> bool:
     return bool(missing)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where the disk has no hard links or the files lie on two disks.
+
+    Raises:
+        OSError: the target exists, or the disk is full or not writable.
+    """
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except OSError:
+        with open(source, "rb") as read, open(target, "xb") as write:
+            shutil.copyfileobj(read, write)
+        sync_file(target)
+
+
 def remove_file(path: str | Path) -> None:
     """Remove a file durably, if there is one.
 
@@ -281,9 +299,13 @@ def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = 
 
 
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = True) -> str:
-    """Read a UTF-8 text file; raises `InputError` like `read_bytes`, and for other encodings."""
+    """Read a UTF-8 text file; raises `InputError` like `read_bytes`, and for other encodings and Excel workbooks."""
+    data = read_bytes(path, limit=limit, follow=follow)
+    if data.startswith(_WORKBOOKS):
+        reason = "is an Excel workbook or another archive, not text; save the sheet as CSV and give that"
+        raise InputError(reason, source=str(path))
     try:
-        return read_bytes(path, limit=limit, follow=follow).decode()
+        return data.decode()
     except UnicodeDecodeError:
         raise InputError("cannot be read (not UTF-8 text)", source=str(path)) from None
 

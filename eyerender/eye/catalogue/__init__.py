@@ -40,12 +40,22 @@ def load_eye(name_or_path: str | Path) -> EyeSpec:
     """
     if isinstance(name_or_path, str) and name_or_path in catalogue_names():
         return _shipped(name_or_path)
-    path = Path(name_or_path)
+    if Path(name_or_path).suffix not in (".yaml", ".yml"):
+        refuse_unknown(str(name_or_path))
+    return EyeSpec.load(Path(name_or_path))
+
+
+def refuse_unknown(name: str) -> None:
+    """Check that a name is one of the catalogue or that of a file.
+
+    Raises:
+        InputError: it is neither.
+    """
+    names = catalogue_names()
     # For a name that no file can have, os.path reports that nothing exists, while Path raises.
-    if path.suffix not in (".yaml", ".yml") and not os.path.exists(path):
-        names, near = catalogue_names(), nearest(str(name_or_path), catalogue_names())
-        raise InputError(f"no such eye; {near}the catalogue holds {', '.join(names)}", source=str(name_or_path))
-    return EyeSpec.load(path)
+    if name not in names and not os.path.exists(name):
+        reason = f"no such eye; {nearest(name, names)}the catalogue holds {', '.join(names)}"
+        raise InputError(reason, source=name)
 
 
 @cache
