@@ -6,7 +6,8 @@
 of the samples that are finished. It is written after these files are synced; later samples are made again.
 
 The next worker takes the folder over by renaming it, and writes metadata to a new file. So a worker that hangs and
-wakes up after its shard was given to another one does no harm.
+wakes up after its shard was given to another one does no harm. Where a worker needs only some of the samples of a
+folder, or continues a finished shard, it links their files into a folder of its own, and the old one stays.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from typing import Any, BinaryIO, Self
 
 from ..base.errors import InputError
 from ..base.storage.files import (
+    PART,
     inside,
+    link_or_copy,
     make_folder,
     opened,
     parse_json,
@@ -36,7 +39,7 @@ from ..base.storage.files import (
 )
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, STAGE, shard_name
-from .done import FILES, PACKED, cpu_family, described, picture_file, read_done_file, run_versions, sum_of
+from .done import FILES, PACKED, cpu_family, described, picture_file, read_done, read_done_file, run_versions, sum_of
 from .maker import MadeSample
 from .packing import SHARD, pack, unpack
 from .plan import Plan
@@ -70,7 +73,9 @@ class PartialShard:
         self._size = 0
         self._writer = Writer()
         self.stage = new_stage(folder, shard)
-        found = _claimed(folder, shard, self.stage)
+        found = _claimed(folder, shard, self.stage, set(plan.spec.shard_samples(shard)))
+        for part in self.stage.rglob(f".*{PART}"):  # a worker was killed while it wrote this file
+            remove_file(part)
         if found is not None and found["schema"] == PACKED.shard:
             found = _unpacked(self.stage, found)
         for kind in (*plan.spec.labels.pictures, SHARD):
@@ -277,7 +282,15 @@ def places(folder: Path, stage: Path, shard: int) -> list[tuple[Path, Path]]:
     return [*((folder / kind / name, stage / kind) for kind in KINDS), (folder / SHARDS / name, stage / SHARD)]
 
 
-def reopen(folder: Path, shard: int) -> None:
+def samples_in(done: Mapping[str, Any]) -> set[int]:
+    """Return the numbers of the samples that a done.json or a checkpoint holds, with those that were given up."""
+    packed = done.get("columns")
+    names = (name.rpartition("/")[2] for name in done["files"] if name.startswith("images/"))
+    own = packed["sample"] if packed else (int(name.partition("-")[0]) for name in names)
+    return {*own, *done["given_up"]}
+
+
+def set_aside(folder: Path, shard: int) -> None:
     """Turn a finished shard back into a partial one, which `PartialShard` can continue with more or fewer samples.
 
     If the process is killed between the moves, `take_back` completes them.
@@ -311,23 +324,51 @@ def take_back(folder: Path, shards: Iterable[int]) -> None:
 
 
 def remove_stages(folder: Path, shards: Iterable[int], finished: set[int]) -> None:
-    """Remove temporary folders of some shards, except checkpoints that later workers can continue."""
+    """Remove temporary folders of some shards, except checkpoints that later workers can continue.
+
+    Of a finished shard those stay that hold further samples: the dataset was larger before.
+    """
     own = set(shards)
     for shard, stage in stages(folder):
-        if shard in own and (shard in finished or not (stage / DONE).is_file()):
+        if shard in own and not _is_needed(stage, folder, shard if shard in finished else None):
             shutil.rmtree(stage, ignore_errors=True)
 
 
-def _claimed(folder: Path, shard: int, stage: Path) -> dict[str, Any] | None:
-    """Rename the partial shard with the most images to `stage`, and return its checkpoint; None if there is none."""
+def _is_needed(stage: Path, folder: Path, shard: int | None) -> bool:
+    """Return whether a checkpoint holds samples that the finished shard lacks."""
+    try:
+        own = samples_in(read_done_file(stage / DONE))
+        return shard is None or not own <= samples_in(read_done(folder, shard))
+    except (InputError, KeyError, TypeError, ValueError):
+        return shard is None and (stage / DONE).is_file()
+
+
+def _claimed(folder: Path, shard: int, stage: Path, wanted: set[int]) -> dict[str, Any] | None:
+    """Take over the checkpoint or the finished shard with the most wanted samples; None if there is none.
+
+    A checkpoint of wanted samples alone is renamed to `stage`. The files of others are linked into it.
+    """
     found = []
-    for number, place in stages(folder):
-        if number == shard:
-            with suppress(InputError):
-                found.append((read_done_file(place / DONE), place))
-    for done, place in sorted(found, key=lambda pair: -int(pair[0]["images"])):
+    finished = folder / SHARDS / shard_name(shard)
+    for file in (*(place / DONE for number, place in stages(folder) if number == shard), finished / DONE):
+        with suppress(InputError, KeyError, TypeError, ValueError):
+            done = read_done_file(file)
+            found.append((len(samples_in(done) & wanted), done, file.parent))
+    for _, done, place in sorted(found, key=lambda one: -one[0]):
         with suppress(OSError):
-            os.rename(place, stage)
+            if place == finished:
+                folders = [(own, new) for own, new in places(folder, stage, shard) if own.is_dir()]
+            elif samples_in(done) <= wanted:
+                os.rename(place, stage)
+                return done
+            else:
+                folders = [(own, stage / own.name) for own in place.iterdir() if own.is_dir()]
+            for own, new in folders:
+                make_folder(new)
+                for file in own.iterdir():
+                    if file.name != DONE:
+                        link_or_copy(file, new / file.name)
+            link_or_copy(place / DONE, stage / DONE)
             return done
     return None
 

@@ -19,17 +19,17 @@ from ..folders.imagefolder import DATASET, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..rig.plausibility import saturation_warnings
 from .assemble import assemble, damage
-from .done import cpu_family, described, read_done
+from .done import cpu_family, read_done
 from .environment import environment
 from .estimate import Speed, keep_rate
 from .options import RunOptions
-from .partial import checkpoints, reopen
+from .partial import checkpoints, set_aside
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .realise import frames_of
 from .runfile import begin, refuse_another_count, refuse_taken, settle, was_resized
 from .selection import in_spread_order
-from .shard import Staged, commit, is_finished, remove_leftovers, withdraw_damaged
+from .shard import Staged, commit, fits, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
 from .status import Log
 from .worker import Job
@@ -128,7 +128,7 @@ def opened_run(
     else:
         refuse_taken(folder)
     frames = plan.scenes.frames if plan.scenes is not None and plan.scenes.frames else frames_of(plan)
-    created = False
+    created, unfit = False, set[int]()
     try:
         created = make_folder(folder)
         with run_lock(folder, part, say):
@@ -143,6 +143,7 @@ def opened_run(
                 progress=progress,
                 say=say,
                 log=Log(folder, part),
+                unfit=unfit,
             )
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
@@ -160,7 +161,7 @@ def opened_run(
         begun = sum(images for shard, images in checkpoints(folder).items() if shard in shards)
         others = f", and {begun} images of others" if begun else ""
         say(
-            f"{len(finished(folder) & shards)} of {len(shards)} shards are finished{others}; "
+            f"{len((finished(folder) & shards) - unfit)} of {len(shards)} shards are finished{others}; "
             f"start again on {path} to resume"
         )
         raise
@@ -217,6 +218,7 @@ class Run:
     speed: Speed = field(default_factory=Speed)
     makers: set[str] = field(default_factory=set)  # backends and processors that made shards
     verified: set[int] = field(default_factory=set)  # shards whose checksums this run has verified
+    unfit: set[int] = field(default_factory=set)  # finished shards that get more or fewer samples
     todo: list[int] = field(default_factory=list)  # the shards to make
     intact: bool = False  # whether the dataset is assembled already
 
@@ -235,7 +237,7 @@ class Run:
         self.todo = in_spread_order(sorted(mine - done))
         problem: str | None = DATASET
         if resumed:
-            remove_leftovers(self.folder, mine, done)
+            remove_leftovers(self.folder, mine, finished(self.folder))
             problem = next(damage(self.folder, self.plan.digest, quick=not self._verifies), None)
             if problem is not None and ((self.folder / DATASET).exists() or not self.todo):
                 self.repaired(f"the dataset is assembled again: {problem}")
@@ -288,8 +290,8 @@ class Run:
         else:
             self.verified |= done
         if not spec.is_packed or was_resized(self.folder):
-            self._reopen(mine | {shard for shard in done - set(spec.shards) if shard % n == k - 1})
-        return finished(self.folder)
+            self._resize(mine | {shard for shard in done - set(spec.shards) if shard % n == k - 1})
+        return finished(self.folder) - self.unfit
 
     def _assembled(self, intact: bool) -> tuple[set[int], dict[str, Any] | None]:
         """Return the missing shards and the dataset's statistics; assemble the dataset if no shard is missing.
@@ -307,7 +309,7 @@ class Run:
                 # These are the shards of other parts; this run has verified or made its own ones.
                 self._withdraw(set(self.plan.spec.shards) - self.verified)
             if was_resized(self.folder):
-                self._reopen(set(self.plan.spec.shards))
+                self._resize(set(self.plan.spec.shards))
             missing = self._missing()
             if missing:
                 remove_file(self.folder / DATASET)
@@ -352,7 +354,11 @@ class Run:
         self.log.write("repair", what=what)
 
     def _missing(self) -> set[int]:
-        return set(self.plan.spec.shards) - finished(self.folder)
+        return set(self.plan.spec.shards) - (finished(self.folder) - self.unfit)
+
+    def has(self, shard: int) -> bool:
+        """Return whether a shard of this part is finished with the requested samples."""
+        return shard not in self.unfit and is_finished(self.folder, shard)
 
     def _withdraw(self, shards: set[int]) -> None:
         """Verify finished shards, and withdraw damaged ones so that they are made again."""
@@ -361,22 +367,17 @@ class Run:
             self.repaired(f"shard {shard} is made again: {problem}")
         self.verified |= shards - damaged.keys()
 
-    def _reopen(self, shards: set[int]) -> None:
-        """Turn finished shards whose samples do not match the requested number of samples into partial ones."""
-        wanted = set(self.plan.spec.shards)
-        reopened, aside = 0, 0
-        for shard in sorted(finished(self.folder) & shards):
-            if shard in wanted:
-                done = read_done(self.folder, shard)
-                if (done["samples"], done.get("chosen")) == described(self.plan.spec.shard_samples(shard)):
-                    continue
-                reopened += 1
-            else:
-                aside += 1
-            reopen(self.folder, shard)
-        if reopened or aside:
-            self.say(f"{reopened} finished shards get more or fewer samples; {aside} are set aside")
-            self.log.write("resize", reopened=reopened, aside=aside)
+    def _resize(self, shards: set[int]) -> None:
+        """Find the finished shards that get more or fewer samples, and set those aside that are not requested."""
+        spec, there = self.plan.spec, finished(self.folder) & shards
+        aside = there - set(spec.shards)
+        self.unfit -= there
+        self.unfit |= {shard for shard in there - aside if not fits(self.folder, shard, spec.shard_samples(shard))}
+        for shard in sorted(aside):
+            set_aside(self.folder, shard)
+        if self.unfit or aside:
+            self.say(f"{len(self.unfit)} finished shards get more or fewer samples; {len(aside)} are set aside")
+            self.log.write("resize", reopened=len(self.unfit), aside=len(aside))
 
     def _engine(self, shards: int) -> LocalPool | RayEngine:
         options = self.options
@@ -406,9 +407,10 @@ class Run:
     def staged(self, staged: Staged, worker: str) -> None:
         """Record that a shard is written."""
         samples = len(self.plan.spec.shard_samples(staged.shard))
-        if not is_finished(self.folder, staged.shard):
+        if not self.has(staged.shard):
             commit(self.folder, staged)
             self.verified.add(staged.shard)
+            self.unfit.discard(staged.shard)
             self.speed.take(staged, samples, worker)
         self.counts.take(staged.shard, samples)
         self.counts.rejected += staged.rejected

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..base.errors import InputError
-from ..base.storage.files import make_folder, remove_file, sync_folder
+from ..base.storage.files import PART, exchange_folders, link_or_copy, make_folder, remove_file, sync_folder
 from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, shard_name
-from .done import FILES, PACKED, compare_sums, read_done
+from .done import FILES, PACKED, compare_sums, described, read_done, read_done_file
 from .maker import Maker
-from .partial import PartialShard, places, remove_stages, take_back
+from .partial import PartialShard, places, remove_stages, samples_in, set_aside, take_back
 
 
 class Stopped(Exception):
@@ -101,10 +101,18 @@ def _until(stop: Callable[[], bool], samples: Iterable[int]) -> Iterator[int]:
 def commit(folder: Path, staged: Staged) -> None:
     """Put a staged shard in place, done.json last.
 
+    If the dataset grows, the finished shard, which holds some of its samples, stays readable. If it shrinks, the
+    finished shard is set aside.
+
     Raises:
         OSError: a file cannot be moved.
     """
     stage = Path(staged.stage)
+    if is_finished(folder, staged.shard):
+        if samples_in(read_done(folder, staged.shard)) <= samples_in(read_done_file(stage / DONE)):
+            _replace(folder, stage, staged.shard)
+            return
+        set_aside(folder, staged.shard)
     moves = [(place, own) for place, own in places(folder, stage, staged.shard) if own.is_dir()]
     for place, own in moves:
         shutil.rmtree(place, ignore_errors=True)  # remains of a run that ended between these renames
@@ -115,12 +123,52 @@ def commit(folder: Path, staged: Staged) -> None:
     lines = moves[-1][0]
     os.rename(stage / DONE, lines / DONE)
     sync_folder(lines)
-    stage.rmdir()
+    shutil.rmtree(stage, ignore_errors=True)
+
+
+def _replace(folder: Path, stage: Path, shard: int) -> None:
+    """Put a staged shard in the place of a finished one that holds some of its samples.
+
+    Whenever the process is killed, one of the two is in place, and the stage can be put in place again.
+    """
+    *pictures, (lines, own) = places(folder, stage, shard)
+    for place, new in pictures:
+        if new.is_dir():
+            make_folder(place)
+            for file in new.iterdir():
+                _put(file, place / file.name)
+            sync_folder(place)
+    if (own / LINES).exists():
+        _put(own / LINES, lines / LINES)
+        _put(stage / DONE, lines / DONE)
+    else:  # a packed shard's files belong together
+        os.rename(stage / DONE, own / DONE)
+        exchange_folders(own, lines)
+    sync_folder(lines)
+    shutil.rmtree(stage, ignore_errors=True)
+
+
+def _put(file: Path, place: Path) -> None:
+    """Give a staged file its place, where another version of it may be."""
+    if not (place.exists() and place.samefile(file)):
+        new = place.with_name(f".{place.name}{PART}")
+        new.unlink(missing_ok=True)
+        link_or_copy(file, new)
+        os.replace(new, place)
 
 
 def is_finished(folder: Path, shard: int) -> bool:
     """Return whether a shard has a done.json."""
     return (folder / SHARDS / shard_name(shard) / DONE).is_file()
+
+
+def fits(folder: Path, shard: int, samples: Sequence[int]) -> bool:
+    """Return whether a shard is finished with exactly these samples."""
+    try:
+        done = read_done(folder, shard)
+    except InputError:
+        return False
+    return (done["samples"], done.get("chosen")) == described(samples)
 
 
 def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:

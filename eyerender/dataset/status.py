@@ -20,8 +20,10 @@ from typing import Any
 from ..base.errors import InputError
 from ..base.storage.files import opened, parse_json, printable
 from ..folders.imagefolder import DATASET, LOG, RUN, finished, read_run
+from .done import read_done
 from .partial import checkpoints
 from .runfile import check_work
+from .shard import fits
 from .spec import DatasetSpec
 
 SCHEMA = "eyerender/status/1"
@@ -128,9 +130,14 @@ def status(path: str | Path) -> dict[str, Any]:
     selection = spec.selection
     parts = _parts(folder)
     shards, there = selection.shards, finished(folder)
-    done = sorted(there.intersection(shards))
+    done = there.intersection(shards)
+    if run.get("resized"):  # some of them get more or fewer samples
+        done = {shard for shard in done if fits(folder, shard, spec.shard_samples(shard))}
     kept = checkpoints(folder)
-    missing = frozenset(shards) - there
+    missing = frozenset(shards).difference(done)
+    for shard in missing & there:
+        with suppress(InputError):
+            kept[shard] = max(kept.get(shard, 0), read_done(folder, shard)["images"])
     at_work = sum(images for shard, images in kept.items() if shard in missing)
     samples = sum(map(selection.shard_count, done))
     is_finished = (folder / DATASET).is_file()

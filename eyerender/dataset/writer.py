@@ -22,7 +22,7 @@ from .ownscenes import GivenScene, OwnScenes, given_scene
 from .partial import PartialShard
 from .plan import Plan
 from .run import Run, opened_run
-from .shard import Stopped, is_finished, staged
+from .shard import Stopped, staged
 from .spec import MAX_COUNT, SPLIT_NAME, DatasetSpec
 
 _SETTINGS = ("name", "description", "licence", "shard_size", "seed", "labels", "require")
@@ -143,14 +143,14 @@ class DatasetWriter:
             InputError: it is no number of a sample of this part.
         """
         shard = self._shard_of(sample)
-        return is_finished(self._path, shard) or sample in self._entered(shard).made
+        return self._opened_run.has(shard) or sample in self._entered(shard).made
 
     def missing(self) -> Iterator[int]:
         """Yield the numbers of the samples of this part that are not stored yet, in order."""
         for shard in sorted(self._opened_run.mine()):
-            if not is_finished(self._path, shard):
+            if not self._opened_run.has(shard):
                 for sample in self._plan.spec.shard_samples(shard):
-                    if not is_finished(self._path, shard) and sample not in self._entered(shard).made:
+                    if not self._opened_run.has(shard) and sample not in self._entered(shard).made:
                         yield sample
 
     def add(

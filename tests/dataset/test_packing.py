@@ -13,7 +13,7 @@ from eyerender.base.errors import EyerenderError, InputError
 from eyerender.dataset.assemble import assemble, verify_dataset
 from eyerender.dataset.maker import MadeImage, MadeSample
 from eyerender.dataset.merge import merge
-from eyerender.dataset.partial import PartialShard, reopen
+from eyerender.dataset.partial import PartialShard, set_aside
 from eyerender.dataset.realise import realise, sample_line
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import Staged, commit
@@ -86,14 +86,14 @@ def test_shards_are_packed_read_grown_and_merged(samples, tmp_path):
 
     # A shard that is opened again and finished has the same bytes; so has one that first held fewer samples.
     before = tree(out)
-    reopen(out, 1)
+    set_aside(out, 1)
     write(out, made, samples, [1])
     assert tree(out) == before
     few = plan(**PACKED, planned=24, count=7, choice="spread")
     grown = tmp_path / "grown"
     make(grown, few, samples)
     for shard in few.spec.shards:
-        reopen(grown, shard)
+        set_aside(grown, shard)
     write(grown, made, samples, made.spec.shards)
     assert {name: before[name] for name in before if name.startswith("shards")} == {
         name: value for name, value in tree(grown).items() if name.startswith("shards")
@@ -132,7 +132,7 @@ def test_a_place_in_a_tar_and_a_name_are_not_trusted(samples, tmp_path):
 def test_a_full_disk_while_a_shard_is_unpacked_loses_nothing(samples, tmp_path):
     made, out = plan(**PACKED), tmp_path / "out"
     make(out, made, samples)
-    reopen(out, 1)
+    set_aside(out, 1)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:

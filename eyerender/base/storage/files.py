@@ -8,6 +8,7 @@ come from other people, so only regular files within a size limit are read.
 from __future__ import annotations
 
 import csv
+import ctypes
 import errno
 import glob
 import io
@@ -38,6 +39,7 @@ _TO_ZEROS = bytes.maketrans(b"123456789E", b"000000000e")
 _LONG = (b"0" * 200, b"e000", b"e+000")
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{1,30}):/+")  # a single letter is a drive
 _WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # .xlsx, .xls
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _PLAIN = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
 
 
@@ -193,6 +195,21 @@ def link_or_copy(source: Path, target: Path) -> None:
         with open(source, "rb") as read, open(target, "xb") as write:
             shutil.copyfileobj(read, write)
         sync_file(target)
+
+
+def exchange_folders(one: Path, other: Path) -> None:
+    """Exchange two folders on one disk: in one step where the system can do that (Linux, local disks).
+
+    Raises:
+        OSError: a folder cannot be moved.
+    """
+    with suppress(AttributeError):  # not Linux
+        if not ctypes.CDLL(None).renameat2(_HERE, bytes(one), _HERE, bytes(other), _EXCHANGE):
+            return
+    aside = one.with_name(f"{one.name}.{secrets.token_hex(4)}")
+    os.rename(other, aside)
+    os.rename(one, other)
+    os.rename(aside, one)
 
 
 def remove_file(path: str | Path) -> None:
