@@ -242,7 +242,7 @@ BOUNDS = {
     "analytic": 730,
     "apps": 16300,
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
-    "base": 2530,  # one door for child processes and stored files; arguments of public functions checked, for all users
+    "base": 2560,  # one door for child processes and stored files; arguments of public functions checked, for all users
     "cli": 2530,  # tables of features, targets and gaze from the command line
     "dataset": 9910,
     "design": 2810,
