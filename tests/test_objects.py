@@ -130,6 +130,16 @@ def test_with_changes_what_it_names_and_nothing_else():
             scene.with_({wrong: 1})
 
 
+def test_a_new_exposure_time_drops_the_gain_that_was_chosen_with_the_old_one():
+    dim = er.load_scene("webcam").with_(sensor={})
+    assert dim.spec.sensor.gain_dn_per_e is not None
+    longer = dim.with_({"sensor.exposure_ms": 20})
+    assert (longer.spec.sensor.exposure_ms, longer.spec.sensor.gain_dn_per_e) == (20, None)
+    assert dim.with_({"sensor.exposure_ms": None}) == dim
+    stated = dim.with_({"sensor.gain_dn_per_e": 2.0}).with_({"sensor.exposure_ms": 20})
+    assert stated.spec.sensor.gain_dn_per_e == 2
+
+
 def test_with_keeps_an_eye_that_was_given_instead_of_the_files(tmp_path, monkeypatch):
     er.load_eye("E4").dump(tmp_path / "own.yaml")
     monkeypatch.chdir(tmp_path)

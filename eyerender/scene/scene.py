@@ -267,7 +267,7 @@ class Scene:
 
         Args:
             changes: new values by dotted path, as in error messages, such as `{"rig.lights.1.radius_mm": 2.5}`; a None
-                removes a key.
+                removes a key. A new exposure time also replaces a gain that the scene has set by its lights.
             pupil_diameter_mm: diameter of the anatomical pupil.
             gaze_deg: azimuth and elevation of the optic axis, (2,) or (n, 2), instead of the targets.
             target_mm: world points that are fixated, (3,) or (n, 3), instead of the targets.
@@ -292,6 +292,8 @@ class Scene:
             paths["eye.pupil_diameter_mm"] = pupil_diameter_mm
         if spp is not None:
             paths["image.spp"] = spp
+        if "sensor.exposure_ms" in paths and self.spec.sensor == self._exposed_automatically:
+            data["sensor"].pop("gain_dn_per_e", None)  # it was chosen with that time
         for path, value in paths.items():
             _put(data, path, value)
         spec = SceneSpec.from_mapping(data)
@@ -315,10 +317,13 @@ class Scene:
     @property
     def exposure_excess(self) -> float:
         """Factor by which exposure time and gain exceed those that the scene would set by its lights."""
-        own = self.spec.sensor
-        open_ = own.model_copy(update={"exposure_ms": None, "gain_dn_per_e": None})
-        chosen = _exposed(self.spec.model_copy(update={"sensor": open_}), self.rig)
+        own, chosen = self.spec.sensor, self._exposed_automatically
         return own.time_ms * own.gain / (chosen.time_ms * chosen.gain)
+
+    @property
+    def _exposed_automatically(self) -> Sensor:
+        open_ = self.spec.sensor.model_copy(update={"exposure_ms": None, "gain_dn_per_e": None})
+        return _exposed(self.spec.model_copy(update={"sensor": open_}), self.rig)
 
     @property
     def name(self) -> str:
