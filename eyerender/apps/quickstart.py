@@ -47,7 +47,7 @@ def run_quickstart(
         backend: the render backend.
         threads: total number of processor threads; None: all.
         overwrite: replace the contents of the folder.
-        progress: called with (done, total, note).
+        progress: called with (images done, images in all, note), once for rendering and once for extraction.
         warn: called for probable mistakes in the scene before the work starts, and for saturated images before they are
             written or reused; it may raise.
 
@@ -61,11 +61,8 @@ def run_quickstart(
         warn(loaded.warnings())
     count = len(loaded.index())
 
-    def step(offset: int, what: str) -> Progress:
-        def show(done: int, _total: int, _note: str) -> None:
-            notify(progress, offset + done, 2 * count + 1, what)
-
-        return show
+    def step(what: str) -> Progress:
+        return lambda done, total, note: notify(progress, done, total, f"images {what}" if done else note)
 
     start = time.monotonic()
     timings = []
@@ -76,7 +73,7 @@ def run_quickstart(
             backend=backend,
             threads=threads,
             overwrite=overwrite,
-            progress=step(0, "rendering"),
+            progress=step("rendered"),
             warn=warn,
         )
         timings.append(Timing(f"observing and rendering {count} windows", time.monotonic() - start))
@@ -85,10 +82,9 @@ def run_quickstart(
     if warn is not None:
         saturated = images.dataset.get("statistics", {}).get("images_saturated", 0)
         warn(saturation_warnings(saturated, len(images.entries), loaded.source))
-    result = _compared(images, [loaded.rig] * len(loaded.index()), Regression(), "", step(count, "extracting"))
+    result = _compared(images, [loaded.rig] * len(loaded.index()), Regression(), "", step("extracted"))
     timings.append(Timing("extracting and calibrating", time.monotonic() - start))
     write_report(folder / REPORT, loaded, result, images.entries, timings)
-    notify(progress, 2 * count + 1, 2 * count + 1, "done")
     return result
 
 
@@ -103,7 +99,7 @@ def compare_folder(
         path: a folder that `render`, `quickstart` or `generate` wrote.
         estimator: gaze estimator used for both; default: `er.gaze.Regression("R3")`.
         name: name of the estimator in the result; default: as for `compare`.
-        progress: called with (images done, images in all, "").
+        progress: called with (images done, images in all, "images").
 
     Raises:
         InputError: the folder is of another kind, or an image or a record in it cannot be read.

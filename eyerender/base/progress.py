@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 Progress = Callable[[int, int, str], None]
-"""Called with the number of finished items, the total, and a note (often "")."""
+"""Called with the number of finished items, the total, and a note that begins with what is counted ("images")."""
+COMPILING = "images; kernels are compiled before the first one"
+"""Note of the first report of work that renders images."""
 Say = Callable[[str], None]
 """Called with one line of text for the user."""
 
@@ -19,9 +21,9 @@ def notify(progress: Progress | None, done: int, total: int, note: str) -> None:
         progress(done, total, note)
 
 
-def followed(items: Sequence[T], progress: Progress | None) -> Iterator[T]:
+def followed(items: Sequence[T], progress: Progress | None, unit: str) -> Iterator[T]:
     """Yield items and report progress after each; the first report, with 0 items done, states the total."""
-    return followed_by(items, len(items), progress)
+    return followed_by(items, len(items), progress, unit)
 
 
 def one_behind(items: Iterable[T]) -> Iterator[T]:
@@ -44,9 +46,14 @@ def one_behind(items: Iterable[T]) -> Iterator[T]:
     yield from held
 
 
-def followed_by(items: Iterable[T], total: int, progress: Progress | None) -> Iterator[T]:
-    """Yield items from an iterator that has no length, and report progress out of `total` like `followed`."""
-    notify(progress, 0, total, "")
+def followed_by(
+    items: Iterable[T], total: int, progress: Progress | None, unit: str, first: str | None = None
+) -> Iterator[T]:
+    """Yield items from an iterator that has no length, and report progress out of `total` like `followed`.
+
+    The note of each report is `unit`; that of the first one is `first`, if given.
+    """
+    notify(progress, 0, total, unit if first is None else first)
     for k, item in enumerate(items):
         yield item
-        notify(progress, k + 1, total, "")
+        notify(progress, k + 1, total, unit)

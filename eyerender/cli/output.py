@@ -78,16 +78,14 @@ def progress(what: str) -> Iterator[Progress]:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Bars(*columns, console=Console(stderr=True), transient=False) as bar:
             task = bar.add_task(what, total=None)
-            yield lambda done, total, note: bar.update(task, completed=done, total=total, description=note or what)
+            yield lambda done, total, note: bar.update(task, completed=done, total=total, description=f"{what}: {note}")
         return
     last = [time.monotonic() - 10.0]
 
     def line(done: int, total: int, note: str) -> None:
         now = time.monotonic()
-        if done == 0:
-            return  # the total alone is worth no line
-        if done == total or now - last[0] >= 2:
+        if done in (0, total) or now - last[0] >= 2:
             last[0] = now
-            say(f"{what}: {done}/{total}{' ' + note if note else ''}")
+            say(f"{what}: {done}/{total} {note}")
 
     yield line

@@ -330,7 +330,7 @@ class Run:
         Raises:
             EyerenderError: some shards could not be made; the engines raise further errors.
         """
-        self.progress(0, self.counts.total, "samples")
+        self.progress(0, self.counts.total, "samples; kernels are compiled before the first one")
         try:
             lost = self._engine(len(todo)).run(todo, self)
         except BaseException as error:

@@ -51,7 +51,7 @@ def preview(
         seed: replaces the seed of a file.
         backend: the render backend.
         threads: total number of processor threads; by default all.
-        progress: called with (images done, images in all, "").
+        progress: called with (images done, images in all, "images").
         warn: called with warnings about the scene or spec before anything is rendered, and about saturated images
             before the file is written; if it raises, nothing is written.
 
@@ -74,7 +74,7 @@ def preview(
     for total, tile, is_white in maker:
         tiles.append(tile)
         saturated += is_white
-        notify(progress, len(tiles), total, "")
+        notify(progress, len(tiles), total, "images")
     if warn is not None:
         warn(saturation_warnings(saturated, len(tiles), what.source))
     with written(path) as file:

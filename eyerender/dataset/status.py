@@ -94,7 +94,7 @@ class _Part:
         if kind == "start":
             self.state, self.images, self.retries = "running", 0, 0
         elif kind in ("end", "stop"):
-            self.state = "stopped"
+            self.state = "finished" if kind == "end" else "stopped"
         elif kind == "retry":
             self.retries += 1
         elif kind == "shard":

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..backends.choose import BackendChoice, choose_backend
 from ..base.arrays import Bytes, Floats, Singles
 from ..base.errors import InputError
-from ..base.progress import Progress, followed_by, one_behind
+from ..base.progress import COMPILING, Progress, followed_by, one_behind
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..eye.refraction import at_cornea_d
@@ -97,7 +97,7 @@ def render_windows(
         backend: the backend, if no renderer is given.
         threads: number of processor threads for rendering; None: all.
         renderer: an existing renderer (see `make_renderer`).
-        progress: called with (done, n, "") after each image.
+        progress: called with (images done, n, note) after each image.
 
     Raises:
         InputError: the scene's windows cannot be rendered.
@@ -108,7 +108,7 @@ def render_windows(
     if renderer is None:
         renderer = make_renderer(backend, threads)
     images = (begun.image() for begun in one_behind(begin_each([frames], renderer)))
-    yield from followed_by(images, len(frames), progress)
+    yield from followed_by(images, len(frames), progress, "images", COMPILING)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ import numpy as np
 from ..analytic.observer import trace
 from ..backends.choose import BackendChoice
 from ..base.errors import InputError
-from ..base.progress import Progress, notify
+from ..base.progress import COMPILING, Progress, notify
 from ..gaze.budget import ESTIMATOR
 from ..rig.exposure import recorded
 from ..rig.imaging import Ambient, Lens
@@ -62,7 +62,7 @@ def budget_steps(
         seeds: number of exposures of each image with other noise.
         backend: backend that renders.
         threads: number of processor threads for rendering; None: all.
-        progress: called with (images done, images in all, "").
+        progress: called with (images done, images in all, note).
 
     Raises:
         InputError: the frames have no targets, or seeds < 1.
@@ -94,13 +94,14 @@ def _image_steps(
         rows.setdefault((cause, seed), []).append(observer.observe_images([image]))
 
     scenes = ([(ideal, "extraction")] if apart else []) + [(own, "image formation" if apart else "image")]
+    notify(progress, 0, len(scenes) * len(frames), COMPILING)
     for k, (scene, cause) in enumerate(scenes):
         images = render_windows(frames.of_scene(scene), renderer=renderer)
         for done, image in enumerate(images, 1):
             note(cause, 0, image)
             for seed in range(seeds) if scene is own and sensor.noise else ():
                 note("noise", seed, exposed_again(image, scene, sensor, seed))
-            notify(progress, k * len(frames) + done, len(scenes) * len(frames), "")
+            notify(progress, k * len(frames) + done, len(scenes) * len(frames), "images")
     steps: dict[str, list[Observations]] = {}
     for (cause, _), seen in rows.items():
         steps.setdefault(cause, []).append(concatenate(seen))

@@ -42,7 +42,7 @@ def render_folder(
         threads: total number of processor threads; None: all.
         overwrite: replace the contents of the folder.
         exr: also write the noise-free linear irradiance as EXR.
-        progress: called with (images done, images in all, "").
+        progress: called with (images done, images in all, note).
         warn: called for saturated images before the folder is put in place; if it raises, nothing is written. Warnings
             that need no rendering are in `Scene.warnings`.
 

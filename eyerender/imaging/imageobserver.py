@@ -59,7 +59,7 @@ class ImageObserver:
         gamma: encoding gamma of the images; 1 is linear.
         backend: backend that renders the frames.
         threads: number of processor threads for rendering; None: all.
-        progress: called with (done, all, "") after each image.
+        progress: called with (images done, images in all, "images") after each image.
     """
 
     settings: ExtractionSettings = field(default_factory=ExtractionSettings)
@@ -112,7 +112,7 @@ class ImageObserver:
         `exposed` converts each image before extraction, for instance to another exposure.
         """
         found, row = Gathering(), 0
-        for entry in followed(entries, progress):
+        for entry in followed(entries, progress, "images"):
             if len(entry.records) == 0:
                 raise InputError("has no records", source=str(entry.path))
             image = entry.image() if exposed is None else exposed(entry.image(), entry)
@@ -159,7 +159,7 @@ class ImageObserver:
         job = _FileJob(settings=self.settings, gamma=self.gamma, eyes=eyes, pictures=pictures, lenient=lenient)
         count = processes if len(paths) >= LEAST_FOR_POOL else 1
         with mapper(count, initializer=single_threaded, chunksize=4) as each:
-            for k, done in enumerate(followed_by(each(job, paths), len(paths), progress)):
+            for k, done in enumerate(followed_by(each(job, paths), len(paths), progress, "images")):
                 try:
                     if isinstance(done, InputError):
                         raise done

@@ -72,7 +72,7 @@ def render(
         spp: samples per pixel.
         backend: the render backend.
         threads: number of processor threads for rendering; None: all.
-        progress: called with (done, total, "") after each image.
+        progress: called with (images done, images in all, note) after each image.
         picture: fields of the scene that affect only its images: `image`, `sensor`, `look`, `region`, `lens`, `motion`,
             `ambient`, `seed`.
 

@@ -99,7 +99,7 @@ def observe_video(
                 file.writelines(json.dumps(one, allow_nan=False).encode() + b"\n" for one in seen.records())
             count, pupils, coloured = count + 1, pupils + len(found), coloured + frame.colour
             ok += sum(one.pupil.ok for one in found)
-            notify(progress, count, max(video.count, count), "")
+            notify(progress, count, max(video.count, count), "frames")
         if file is not None and table:
             file.write(features_csv(gathered.all(), lights_of(scene)).encode())
     if coloured and warn is not None:

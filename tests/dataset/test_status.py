@@ -63,8 +63,10 @@ def test_a_run_says_how_far_it_is(folder, capsys):
     text = capsys.readouterr().out
     assert text.startswith("running: 200 of 1000 samples, 4 of 20 shards, 1 retries\n1.08 images/s, 12 min 18 s left\n")
     assert "b 2/3: stalled" in text
+    log = folder / "log.jsonl"
+    log.write_text(log.read_text().rpartition("\n")[0] + "\n" + event("c", "3/3", "end", 90, 1))
     (folder / "dataset.json").write_text("{}")
-    assert status(folder)["state"] == "finished"
+    assert status(folder)["state"] == status(folder)["parts"][2]["state"] == "finished"
 
 
 def test_what_is_no_run_is_refused(tmp_path):

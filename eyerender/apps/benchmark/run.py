@@ -55,7 +55,7 @@ def bench_extractors(
             `NAME=`; names must differ. By default all installed ones; the results list those that cannot run here, with
             the reason.
         options: jobs, time limits, checks and the like.
-        progress: called with (done, total, note).
+        progress: called with (answers, answers in all, note).
         changes: fields of `BenchOptions` by name, instead of those of `options`.
 
     Returns:
@@ -82,9 +82,9 @@ def bench_extractors(
     def step(name: str) -> None:
         nonlocal done
         done += 1
-        notify(progress, done, total, name)
+        notify(progress, done, total, f"answers, {name}")
 
-    notify(progress, 0, total, "")
+    notify(progress, 0, total, "answers")
     with staged(output, overwrite=is_bench) as place:
         answers = Answers(Path(output) / ANSWERS, task_of(chosen, code, keys), fresh=options.fresh)
         runs = [_classified(run, images) for run in ask_extractors(chosen, images, options, answers=answers, step=step)]

@@ -92,7 +92,7 @@ def read(path: str | Path, *, limit: int, workers: int, progress: Progress | Non
         path: its folder.
         limit: the largest number of images that are read.
         workers: processes that read them.
-        progress: called with (images read, images to read, "").
+        progress: called with (images read, images to read, "images").
 
     Raises:
         InputError: it is not a folder of images.
@@ -108,7 +108,7 @@ def read(path: str | Path, *, limit: int, workers: int, progress: Progress | Non
         for row in part:
             store.take(done, row)
             done += 1
-        notify(progress, done, len(rows), "")
+        notify(progress, done, len(rows), "images")
     return store.contents(folder, rows)
 
 

@@ -34,7 +34,7 @@ def measure_folder(
         gamma: the images store intensity^(1 / gamma). By default it is what the folder states (this package's folders
             and exports do), else 1.
         limit: the largest number of images, which are chosen evenly over the folder.
-        progress: called with (images done, images in all, "").
+        progress: called with (images done, images in all, "images").
 
     Raises:
         InputError: there is no such folder or it holds no images, or an argument is out of range.
@@ -48,7 +48,7 @@ def measure_folder(
     rows, skipped, tiles = [], [], []
     cut: list[dict[str, tuple[Bytes, ...]]] = []
     found = pictures(source, known)
-    for name in followed(source.names, progress):
+    for name in followed(source.names, progress, "images"):
         picture = next(found)
         if isinstance(picture, Skipped):
             skipped.append(picture)
@@ -104,7 +104,7 @@ def realism(
         output: an HTML page to write, with the table and montages at equal scale.
         gammas: none, one for all folders, or one for each.
         limit: the largest number of images of a folder.
-        progress: called with (images done, images in all, "") for each folder.
+        progress: called with (images done, images in all, "images") for each folder.
 
     Returns:
         A mapping (schema eyerender/realism/2): the definitions, the statistics of each folder, and for two folders the

@@ -152,7 +152,7 @@ def estimator_errors(
                 rows = np.flatnonzero(seen.index.camera == camera)
                 found = ray_errors_deg(seen.take(rows), _taken(rays, rows))
                 errors[name][k, seen.index.fixation[rows]] = np.fmin(errors[name][k, seen.index.fixation[rows]], found)
-        notify(progress, k + 1, len(subjects), "people with images" if images else "estimators")
+        notify(progress, k + 1, len(subjects), "people, " + ("images" if images else "estimators"))
     for name, found in errors.items():
         without = float(np.isnan(found).mean(axis=1).max(initial=0.0))
         if not reasons[name] and without > 0.05:

@@ -122,7 +122,7 @@ def _result(layout: KnownLayout, people: int, workers: int | None, progress: Pro
         relief_mm=layout.relief_mm,
         unknowns=Unknowns.population(slippage_mm=max(3.0, layout.slippage_mm)).to_mapping(),
     )
-    told = None if progress is None else lambda done, total, _what: progress(done, total, layout.name)
+    told = None if progress is None else lambda done, total, _what: progress(done, total, f"people, {layout.name}")
     found = figures_of_people(survey, sensor_noise(scene), people, workers=workers, progress=told)
     needed = min(2, len(scene.rig.lights))
     place = scene.eye_position_mm("right")

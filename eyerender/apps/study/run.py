@@ -186,11 +186,11 @@ def _collected(
 ) -> list[Any]:
     """Run a job on each item and collect the results in order."""
     out = []
-    notify(progress, 0, len(items), "")
+    notify(progress, 0, len(items), "eye models")
     with mapper(min(workers, len(items))) as mapped:
         for k, part in enumerate(mapped(job, items)):
             out.append(part)
-            notify(progress, k + 1, len(items), names[k])
+            notify(progress, k + 1, len(items), f"eye models, {names[k]}")
     return out
 
 

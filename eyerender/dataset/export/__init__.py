@@ -80,7 +80,7 @@ def export(
         shuffle: seed of a random order of the images; by default they are in the order of the samples. It is refused
             for `teyed` and `labels`, which have an order of their own.
         overwrite: replace the contents of `out`.
-        progress: called with images done, images in all and "".
+        progress: called with images done, images in all and "images".
 
     Raises:
         InputError: the layout or encoding is unknown, the folder is of another kind, a checksum is wrong,
@@ -98,7 +98,7 @@ def export(
     total = len(folder.entries)
 
     def step(done: int) -> None:
-        notify(progress, done, total, "")
+        notify(progress, done, total, "images")
 
     step(0)
     items = Items(folder, step, workers=workers, shuffle=shuffle)
