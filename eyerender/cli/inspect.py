@@ -62,8 +62,9 @@ def _text(data: dict[str, Any]) -> list[str]:
             reason = outlier["reasons"][0]
             lines.append(f"  unusual: {outlier['image']}: {reason['column']} {reason['value']:.4g}, {reason['usual']}")
     if data["difference"] is not None:
-        moved = [s for s in data["difference"]["columns"] if s["distance"] > s["chance"]]
-        lines.append(f"{len(moved)} of {len(data['difference']['columns'])} numbers differ by more than chance")
+        columns, by = data["difference"]["columns"], data["difference"]["by"]
+        moved = [s for s in columns if s["distance"] > s["chance"]]
+        lines.append(f"compared by {by}: {len(moved)} of {len(columns)} numbers differ; chance gives one in twenty")
         for shift in moved[:10]:
             before, after = shift["medians"]
             lines.append(f"  {shift['column']}: distance {shift['distance']:.3f}, median {before:.4g} and {after:.4g}")

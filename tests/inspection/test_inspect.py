@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import ks_2samp, spearmanr
 
 from eyerender.apps.inspection import inspect
-from eyerender.apps.inspection.comparing import sample_of
+from eyerender.apps.inspection.comparing import distance_and_chance
 from eyerender.apps.inspection.duplicates import equal_pictures, near_duplicates
 from eyerender.apps.inspection.outliers import outliers, scores
 from eyerender.apps.inspection.reading import read
@@ -80,8 +80,23 @@ def test_distances_are_those_of_scipy(data, tmp_path):
     listed = {s["column"]: s for s in inspect(data, tmp_path / "other")["difference"]["columns"]}
     name = "draw eye.pupil_diameter_mm"
     assert listed[name]["distance"] == pytest.approx(ks_2samp(*(c.columns[name] for c in contents)).statistic)
-    # The albedo belongs to a subject: it is counted once for each.
-    assert len(sample_of(contents[0], "draw look.iris_albedo")) == 120 // FRAMES
+    assert listed[name]["counts"] == (120 // FRAMES, 60 // FRAMES)
+
+
+def test_images_of_the_same_subjects_differ_by_chance_in_one_case_of_twenty():
+    """Subjects of two random samples differ from each other; with images as the unit, half of the cases would."""
+    rng = np.random.default_rng(5)
+
+    def sample(subjects, shift):
+        units = np.repeat(np.arange(subjects), rng.integers(3, 12, subjects))
+        return shift + rng.normal(size=subjects)[units] + rng.normal(scale=0.5, size=len(units)), units
+
+    def differ(shift):
+        pairs = [distance_and_chance(sample(30, 0.0), sample(20, shift)) for _ in range(300)]
+        return np.mean([distance > chance for distance, chance in pairs])
+
+    assert 0.02 <= differ(0.0) <= 0.09
+    assert differ(1.5) > 0.95
 
 
 def test_correlations_are_those_of_scipy():

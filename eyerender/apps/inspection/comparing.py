@@ -1,8 +1,7 @@
 """How the distributions of two datasets differ: the Kolmogorov-Smirnov distance of each number.
 
-The distance is the largest difference of the two cumulative distributions, 0 to 1. Two random samples of one
-distribution differ by more than c(5 %) sqrt((n + m) / (n m)) in one case of twenty, c = 1.36. Numbers that are the same
-in all images of a subject count once for each subject.
+The distance is the largest difference of the two cumulative distributions, 0 to 1. Images of one subject resemble each
+other, so whole subjects are compared; where a dataset has none or a single one, images are.
 """
 
 from __future__ import annotations
@@ -14,11 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import ks_2samp
 
-from ...base.arrays import Floats
+from ...base.arrays import Floats, Ints
 from .reading import Contents
 
 _CRITICAL = 1.36
 _LEAST = 5
+_LEVELS = np.linspace(0.0, 1.0, 129)
+_DEALS = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,9 +29,9 @@ class Shift:
     Attributes:
         column: its name.
         distance: of Kolmogorov and Smirnov.
-        chance: distance that samples of one distribution exceed in 5 % of cases.
+        chance: distance that chance exceeds in 5 % of cases.
         medians: of both datasets.
-        counts: images, or subjects, that have the number in both.
+        counts: subjects that have the number in both; images where a dataset has less than two subjects.
     """
 
     column: str
@@ -42,19 +43,17 @@ class Shift:
 
 def shifts(first: Contents, second: Contents) -> list[Shift]:
     """Compare all numbers that both datasets have; the largest differences beyond chance come first."""
-    found = []
+    found, by_subject = [], has_subjects(first) and has_subjects(second)
     for name in first.columns:
         if name not in second.columns:
             continue
-        a, b = sample_of(first, name), sample_of(second, name)
-        if min(len(a), len(b)) < _LEAST:
+        a, b = (sample_of(contents, name, by_subject=by_subject) for contents in (first, second))
+        counts = len(np.unique(a[1])), len(np.unique(b[1]))
+        if min(counts) < _LEAST:
             continue
-        distance = float(ks_2samp(a, b, method="asymp").statistic)
-        chance = _CRITICAL * math.sqrt((len(a) + len(b)) / (len(a) * len(b)))
-        medians = float(np.median(a)), float(np.median(b))
-        found.append(
-            Shift(column=name, distance=distance, chance=min(chance, 1.0), medians=medians, counts=(len(a), len(b)))
-        )
+        distance, chance = distance_and_chance(a, b)
+        medians = float(np.median(a[0])), float(np.median(b[0]))
+        found.append(Shift(column=name, distance=distance, chance=chance, medians=medians, counts=counts))
     return sorted(found, key=lambda shift: (shift.distance <= shift.chance, -shift.distance, shift.column))
 
 
@@ -63,18 +62,45 @@ def only_in(first: Contents, second: Contents) -> list[str]:
     return sorted(set(first.columns) - set(second.columns))
 
 
-def sample_of(contents: Contents, name: str) -> Floats:
-    """Numbers of a column; one for each subject where all images of each subject have the same."""
+def sample_of(contents: Contents, name: str, *, by_subject: bool) -> tuple[Floats, Ints]:
+    """Return the numbers of a column (n,), and the unit that each belongs to (n,): its subject or its image."""
     values: Floats = contents.columns[name].astype(float)
+    units = contents.subjects if by_subject else np.arange(len(values))
     there = np.isfinite(values)
-    values, subjects = values[there], contents.subjects[there]
-    order = np.argsort(subjects, kind="stable")
-    values, subjects = values[order], subjects[order]
-    starts = np.flatnonzero(np.diff(subjects, prepend=-2) != 0)
-    if len(starts) < 2 or len(values) == len(starts) or -1 in subjects:
-        return values
-    same = np.maximum.reduceat(values, starts) == np.minimum.reduceat(values, starts)
-    return values[starts] if same.all() else values
+    return values[there], np.unique(units[there], return_inverse=True)[1]
+
+
+def has_subjects(contents: Contents) -> bool:
+    """Return whether all images with a readable line name their subject, and there are several subjects."""
+    subjects = contents.subjects[[bool(name) for name in contents.names]]
+    return bool((subjects >= 0).all()) and len(np.unique(subjects)) > 1
+
+
+def distance_and_chance(first: tuple[Floats, Ints], second: tuple[Floats, Ints]) -> tuple[float, float]:
+    """Compute the Kolmogorov-Smirnov distance of two samples, and the distance that chance exceeds in 5 % of cases.
+
+    With one number per unit, chance is 1.36 sqrt((n + m) / (n m)). Numbers of one unit are not independent, so
+    otherwise the units are dealt to the two datasets at random, and chance is the 95th percentile of the distances.
+
+    Args:
+        first: numbers (n,), and the unit of each (n,), counted from 0.
+        second: those of the other dataset.
+    """
+    distance = float(ks_2samp(first[0], second[0], method="asymp").statistic)
+    sizes = [int(units.max()) + 1 for _, units in (first, second)]
+    if all(size == len(values) for size, (values, _) in zip(sizes, (first, second), strict=True)):
+        return distance, min(_CRITICAL * math.sqrt(sum(sizes) / math.prod(sizes)), 1.0)
+    levels = np.unique(np.quantile(np.concatenate([first[0], second[0]]), _LEVELS, method="inverted_cdf"))
+    below = np.zeros((sum(sizes), len(levels)), np.float32)  # numbers of each unit up to each level
+    for start, (values, units) in zip((0, sizes[0]), (first, second), strict=True):
+        np.add.at(below, (start + units, np.searchsorted(levels, values)), 1)
+    below = np.cumsum(below, axis=1)
+    dealt = np.zeros((_DEALS, sum(sizes)), np.float32)
+    dealt[:, : sizes[0]] = 1
+    mine = np.random.default_rng(0).permuted(dealt, axis=1, out=dealt) @ below
+    other = below.sum(axis=0) - mine
+    distances = np.abs(mine / mine[:, -1:] - other / other[:, -1:]).max(axis=1)
+    return distance, float(np.quantile(distances, 0.95, method="higher"))
 
 
 def shares(first: Contents, second: Contents) -> list[tuple[str, float, Sequence[tuple[str, float, float]]]]:

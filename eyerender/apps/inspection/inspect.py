@@ -13,7 +13,7 @@ import numpy as np
 from ...base.errors import InputError
 from ...base.progress import Progress
 from ...base.storage.files import refuse_special
-from .comparing import Shift, only_in, shares, shifts
+from .comparing import Shift, has_subjects, only_in, shares, shifts
 from .duplicates import equal_pictures, near_duplicates
 from .faults import KINDS, Fault
 from .found import Inspection
@@ -133,6 +133,7 @@ def _same_frames(contents: Contents) -> None:
 def _difference(found: Sequence[Inspection], moved: Sequence[Shift]) -> dict[str, Any]:
     first, second = (one.contents for one in found)
     return {
+        "by": "subjects" if has_subjects(first) and has_subjects(second) else "images",
         "columns": [asdict(shift) for shift in moved],
         "groups": [{"group": name, "distance": d, "shares": rows} for name, d, rows in shares(first, second)],
         "only_in_first": only_in(first, second),
