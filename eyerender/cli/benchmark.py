@@ -59,23 +59,27 @@ def bench_extractors(
 
 def _table(data: dict[str, Any], times: dict[str, Any]) -> str:
     """Format one line per extractor, then the reasons of failures."""
+    common = data["common"]
     lines = [
-        f"{'':<18} {'right':>5} {'wrong':>5} {'none':>5} {'error':>5} {'centre px':>10} {'p95':>8} {'bias x':>8} "
-        f"{'bias y':>8} {'eff.':>5} {'axis a':>8} {'axis b':>8} {'bound.':>7} {'IoU':>6} "
-        f"{'glints':>9} {'gl. px':>7} {'ms':>6}"
+        f"{'':<18} {'right':>5} {'95 %':>14} {'wrong':>5} {'none':>5} {'error':>5} {'common px':>10} {'centre px':>10} "
+        f"{'p95 px':>8} {'bias x px':>9} {'bias y px':>9} {'eff.':>5} {'axis a px':>9} {'axis b px':>9} "
+        f"{'bound. px':>9} {'IoU':>6} {'glints':>9} {'gl. px':>7} {'ms':>6}"
     ]
     for e, spent in zip(data["extractors"], times["extractors"], strict=True):
-        s, g = e["summary"], e["summary"]["glints"]
+        s, g, together = e["summary"], e["summary"]["glints"], common["extractors"].get(e["name"])
         bias, axes = s["centre_bias_px"] or (None, None), s["semi_axes_bias_px"] or (None, None)
         time = spent["cpu_ms"]["median"] or spent["round_trip_ms"]["median"]
         lines.append(
-            f"{e['name']:<18} {s['right']:>5} {s['wrong']:>5} {s['none']:>5} {s['error']:>5} "
-            f"{_f(s['centre_px']['median'], 4):>10} {_f(s['centre_px']['p95'], 4):>8} {_f(bias[0], 4):>8} "
-            f"{_f(bias[1], 4):>8} {_f(s['efficiency']['value'], 2):>5} {_f(axes[0], 4):>8} {_f(axes[1], 4):>8} "
-            f"{_f(s['boundary_px']['median'], 3):>7} {_f(s['iou']['median'], 3):>6} "
+            f"{e['name']:<18} {s['right']:>5} {_span(s['intervals']['right']):>14} {s['wrong']:>5} {s['none']:>5} "
+            f"{s['error']:>5} {_f(together['centre_px']['median'] if together else None, 4):>10} "
+            f"{_f(s['centre_px']['median'], 4):>10} {_f(s['centre_px']['p95'], 4):>8} {_f(bias[0], 4):>9} "
+            f"{_f(bias[1], 4):>9} {_f(s['efficiency']['value'], 2):>5} {_f(axes[0], 4):>9} {_f(axes[1], 4):>9} "
+            f"{_f(s['boundary_px']['median'], 3):>9} {_f(s['iou']['median'], 3):>6} "
             f"{'-' if g is None else '{}/{}'.format(g['matched'], g['true']):>9} "
             f"{_f(g['error_px']['median'] if g else None, 4):>7} {_f(time, 1):>6}"
         )
+    if common["n"]:
+        lines.append(f"common px: median centre error on the {common['n']} pupils that all extractors find right")
     for e in data["extractors"]:
         if e["suggested_origin"]:
             lines.append(f"{e['name']}: {e['suggested_origin']['text']}")
@@ -88,6 +92,12 @@ def _table(data: dict[str, Any], times: dict[str, Any]) -> str:
         )
     lines += [f"{e['name']}: not run: {e['reason']}" for e in data["not_run"]]
     return "\n".join(lines)
+
+
+def _span(found: dict[str, Any]) -> str:
+    """Format the 95 % interval of a rate: that of subjects, or Wilson's where there are less than two."""
+    ends = found["subjects"] or found["wilson"]
+    return "-" if ends is None else f"{ends[0]:.1%} - {ends[1]:.1%}"
 
 
 def _f(value: float | None, digits: int) -> str:

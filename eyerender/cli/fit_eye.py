@@ -66,10 +66,13 @@ def _text(found: dict[str, Any], output: Path) -> str:
     for one in found["eyes"]:
         lines.append(f"{one['eye']} eye: {len(one['frames'])} frames, chi^2 {one['chi2']:.1f} "
                      f"for {one['degrees_of_freedom']} degrees of freedom")  # fmt: skip
+        lines.append(f"  {'change from the prior':<21} {'unit':<5} {'result':>23} {'prior':>12}")
         for name, value in one["person"].items():
             if value["deviation"] != 0.0:
-                spread = "not seen" if value["deviation"] is None else f"+- {value['deviation']:.4g}"
-                lines.append(f"  {name:<16} {value['change']:>+10.4f} {spread}")
+                before = "unknown" if value["prior_deviation"] is None else f"+- {value['prior_deviation']:.4g}"
+                spread = "" if value["deviation"] is None else f" +- {value['deviation']:<10.4g}"
+                cells = f"{value['unit']:<5} {value['change']:>+9.4f}{spread:<14} {before:>12}"
+                lines.append(f"  {name:<21} {cells}{'' if value['learned'] else '  not learned'}")
         if one["not_seen"]:
             lines.append(f"  not seen: {', '.join(one['not_seen'])}")
         if one["file"] is None:

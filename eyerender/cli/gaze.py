@@ -164,7 +164,9 @@ def _gaze_table(data: dict[str, Any]) -> str:
     from ..gaze.predictions import RAYS_SCHEMA
 
     rays = data["schema"] == RAYS_SCHEMA
-    key, title, units = ("direction", "gaze direction", ["deg"]) if rays else ("point_mm", "gaze point mm", UNITS)
+    key, title, units = "point_mm", "gaze point mm", UNITS
+    if rays:
+        key, title, units = "direction", "gaze direction (unit vector)", ["deg"]
     lines = [f"{'frame':>6} {'eye':<6} {title:>33}" + "".join(f"{f'error {unit}':>11}" for unit in units)]
     both = [{**entry, "eye": "both"} for entry in data["binocular"] if entry["point_mm"] is not None]
     for entry in [*data["gaze"], *both]:
@@ -172,7 +174,7 @@ def _gaze_table(data: dict[str, Any]) -> str:
         where = f"missing: {entry['reason']}" if point is None else "".join(f"{v:>11.3f}" for v in point)
         errors = "".join(_cell(entry[f"error_{unit}"], ".3f") for unit in units)
         lines.append(f"{entry['frame']:>6} {entry['eye'] or '-':<6} {where:>33}{errors}")
-    lines += ["", f"{'eye':<6} {'samples':>8} {'data loss':>10}  {'error':<6}{'mean':>11}{'median':>11}{'95 %':>11}"]
+    lines += ["", f"{'eye':<6} {'samples':>8} {'data loss':>10}  {'in':<6}{'mean error':>11}{'median':>11}{'95 %':>11}"]
     for entry in data["summary"]:
         start = f"{entry['eye'] or '-':<6} {entry['samples']:>8} {entry['data_loss']:>10.1%}"
         known = [unit for unit in units if entry[f"error_{unit}"] is not None]

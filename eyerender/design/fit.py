@@ -27,7 +27,7 @@ from .eyefile import changed_file
 from .features import MeasuredFeatures, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information
 from .noise import FeatureNoise
-from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, PERSON, PUPIL, Unknowns
+from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, PERSON, PUPIL, UNITS, Unknowns
 from .varied import (
     Views,
     diameters_mm,
@@ -43,6 +43,8 @@ from .varied import (
 Robust = Literal["geman-mcclure", "huber", "none"]
 CORE = 3.0
 """Rms of a block's whitened residuals up to which the block has full weight."""
+LEARNED = 0.9
+"""A parameter whose deviation is not below this share of its prior's was not learned."""
 _STEPS, _SETTLED = 40, 1e-10
 _POINTS = 30
 _START_AZIMUTH, _START_ELEVATION = np.radians(np.linspace(-36, 36, 9)), np.radians(np.linspace(-24, 24, 7))
@@ -110,6 +112,7 @@ class EyeFit(ArrayValue):
         glint_weight: (n, m) robust weight of each glint.
         converged: (i,) whether the steps settled.
         prior: the eye at the start of the fit.
+        unknowns: the priors of the unknowns.
     """
 
     eye: str
@@ -125,6 +128,7 @@ class EyeFit(ArrayValue):
     glint_weight: Floats
     converged: Bools
     prior: EyeSpec
+    unknowns: Unknowns
 
     @property
     def spec(self) -> EyeSpec:
@@ -136,10 +140,13 @@ class EyeFit(ArrayValue):
         return changed_file(self.prior, self.theta[0])
 
     def to_mapping(self) -> dict[str, Any]:
-        """Convert to JSON values; angles in degrees."""
+        """Convert to JSON values; angles in degrees.
+
+        A parameter of the person is learned if its standard deviation is below 0.9 of its prior's.
+        """
         degrees = np.where(ANGLES, np.degrees(1.0), 1.0)
         shared, spread = self.theta[0, LOCAL:] * degrees[LOCAL:], self.known.person_deviation * degrees[LOCAL:]
-
+        prior = self.unknowns.deviations()[LOCAL:] * degrees[LOCAL:]
         return {
             "eye": self.eye,
             "chi2": float(self.chi2.sum()),
@@ -147,8 +154,14 @@ class EyeFit(ArrayValue):
             "converged": bool(self.converged.all()),
             "not_seen": list(self.known.unseen),
             "person": {
-                name: {"change": float(value), "deviation": finite_or_none(sd)}
-                for name, value, sd in zip(PERSON, shared, spread, strict=True)
+                name: {
+                    "unit": unit,
+                    "change": float(value),
+                    "deviation": finite_or_none(sd),
+                    "prior_deviation": finite_or_none(before),
+                    "learned": bool(np.isfinite(sd) and sd < LEARNED * before),
+                }
+                for name, unit, value, sd, before in zip(PERSON, UNITS[LOCAL:], shared, spread, prior, strict=True)
             },
             "frames": [
                 {
@@ -559,4 +572,5 @@ def _result(
         glint_weight=np.where(found.glint_ok, weights.glints, np.nan),
         converged=converged,
         prior=spec,
+        unknowns=unknowns,
     )

@@ -35,6 +35,10 @@ AZIMUTH, ELEVATION, PUPIL, SLIPPAGE = 0, 1, 2, slice(3, 6)
 RADIUS, ASPHERICITY, DEPTH, KAPPA, ROTATION, POSITION = 6, 7, 8, slice(9, 11), 11, slice(12, 15)
 TORICITY, CENTRE, ELLIPTICITY, SHIFT = slice(15, 17), slice(17, 19), slice(19, 21), slice(21, 23)
 ANGLES = np.array([name in ("azimuth", "elevation", "kappa_nasal", "kappa_up") for name in NAMES])
+_RATIOS = {"asphericity": "1", "ellipticity": "1", "pupil_shift": "mm/mm"}
+UNITS = tuple(
+    "deg" if angle else _RATIOS.get(name.rsplit("_", 1)[0], "mm") for name, angle in zip(NAMES, ANGLES, strict=True)
+)
 
 Knowledge = Literal["known", "unknown"] | Annotated[float, Field(gt=0, le=1e6)]
 """Prior knowledge of a number: known, unknown, or a standard deviation."""

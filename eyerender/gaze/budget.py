@@ -332,8 +332,10 @@ def _rms(errors: Floats) -> float:
 
 def _table(title: str, causes: Sequence[Cause], total: float, mean: float) -> list[str]:
     width = max(len(c.name) for c in causes)
-    lines = [title, f"{'cause':<{width}} {'rms':>8} {'shift':>8} {'pattern':>8} {'scatter':>8} {'net':>9}"]
+    heads = "".join(f"{name + ' deg':>13}" for name in ("rms", "shift", "pattern", "scatter", "net"))
+    lines = [title, f"{'cause':<{width}}{heads}   net, 95 % deg"]
     for c in causes:
-        numbers = "".join(f"{v:>9.4f}" for v in (c.rms_deg, c.shift_deg, c.pattern_deg, c.scatter_deg))
-        lines.append(f"{c.name:<{width}}{numbers} {c.net_deg:>+9.4f}")
-    return [*lines, f"{'total':<{width}}{total:>9.4f}   mean error {mean:.4f} deg"]
+        numbers = "".join(f"{v:>13.4f}" for v in (c.rms_deg, c.shift_deg, c.pattern_deg, c.scatter_deg))
+        ends = "" if c.net_low_deg is None else f"   {c.net_low_deg:+.4f} to {c.net_high_deg:+.4f}"
+        lines.append(f"{c.name:<{width}}{numbers} {c.net_deg:>+12.4f}{ends}")
+    return [*lines, f"{'total':<{width}}{total:>13.4f}   mean error {mean:.4f} deg"]

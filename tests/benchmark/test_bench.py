@@ -23,6 +23,7 @@ from eyerender.apps.benchmark.run import bench_extractors
 from eyerender.apps.benchmark.separate import cheshm_pupil, eight_bits, pupil_of
 from eyerender.apps.benchmark.shipped import PUPIL_LABS_PYTHON, cheshm_python, pupil_labs_python
 from eyerender.base.errors import InputError
+from eyerender.cli.benchmark import _table
 from eyerender.cli.main import run
 from eyerender.extraction.baseline import contour_pupil
 from eyerender.folders.imagefile import read_image, write_png
@@ -75,6 +76,10 @@ def test_the_figures_are_those_of_the_extractors(bench):
     assert 0.3 < s["efficiency"]["value"] < 3.0  # the median of six errors scatters by a factor of two
     assert s["glints"]["recall"] == 1.0
     assert s["glints"]["precision"] == 1.0
+    printed = _table(data, json.loads((out / "times.json").read_text())).splitlines()
+    low, high = s["intervals"]["right"]["subjects"] or s["intervals"]["right"]["wilson"]
+    assert f" 6 {low:.1%} - {high:.1%} " in " ".join(printed[1].split())
+    assert "common px: median centre error on the 6 pupils that all extractors find right" in printed
     spent = json.loads((out / "times.json").read_text())["extractors"]
     assert spent[0]["cpu_ms"]["median"] > 0
     assert spent[2]["cpu_ms"]["n"] == 0
@@ -105,6 +110,9 @@ def test_the_folder_holds_report_table_and_json(bench):
     mine = [float(r["centre_px"]) for r in rows if r["extractor"] == "own-refined"]
     assert np.median(mine) == pytest.approx(data["extractors"][0]["summary"]["centre_px"]["median"])
     page = (out / "report.html").read_text()
+    common = data["common"]["extractors"]["own-refined"]["centre_px"]["median"]
+    assert f"{common:.4f} px" in page
+    assert "least median centre error on the 6 pupils that all of them find right: own-refined" in page
     for words in ("own-refined", "opencv-contour", "ended with exit code 1: no licence", "identity swaps"):
         assert words in page
     # Self-contained: no address but the namespaces of SVG.

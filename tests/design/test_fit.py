@@ -403,11 +403,21 @@ def test_the_command_writes_an_eye_file_that_loads(tmp_path, capsys):
     assert run(["features", "head_mounted", "--json", str(records)]) == 0
     (tmp_path / "u.yaml").write_text("position_mm: unknown\npupil_depth_mm: 0.35\n")
     assert run(["fit-eye", str(records), "-o", str(folder), "--unknowns", str(tmp_path / "u.yaml")]) == 0
-    assert "chi^2" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    out = printed[printed.index("right eye: 9 frames, chi^2") :].splitlines()
+    assert [line.split()[1] for line in out[2:6]] == ["mm"] * 4
     found = json.loads((folder / "fit.json").read_text())
     assert found["schema"] == "eyerender/fit-eye/1"
     (eye,) = found["eyes"]
     assert eye["chi2"] < 1.0
+    depth, place = eye["person"]["pupil_depth"], eye["person"]["position_x"]
+    assert (depth["unit"], depth["prior_deviation"], place["prior_deviation"]) == ("mm", 0.35, None)
+    learned = [name for name, one in eye["person"].items() if one["learned"]]
+    assert learned == [
+        n for n, one in eye["person"].items() if 0 < (one["deviation"] or 0) < 0.9 * (one["prior_deviation"] or np.inf)
+    ]
+    for line in out[2:6]:
+        assert line.endswith("not learned") == (line.split()[0] not in learned)
     assert [f["azimuth_deg"] for f in eye["frames"]] == pytest.approx([15, 0, -15] * 3, abs=5e-3)
     assert er.load_eye(str(folder / "right.yaml")).build().side == "right"
     (tmp_path / "u.yaml").write_text("kapa_deg: 1\n")

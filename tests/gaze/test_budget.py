@@ -200,7 +200,10 @@ def test_the_command_without_images(capsys, tmp_path):
     assert data["schema"] == "eyerender/gaze-budget/1"
     assert [c["name"] for c in data["causes"]] == ["estimator", "eye model", "optics"]
     assert data["transferred"] == []
-    assert f"{data['mean_deg']:.4f} deg" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{data['mean_deg']:.4f} deg" in printed
+    assert "rms deg    shift deg  pattern deg  scatter deg      net deg   net, 95 % deg" in printed
+    assert f"{data['causes'][0]['net_low_deg']:+.4f} to {data['causes'][0]['net_high_deg']:+.4f}" in printed
     posed = er.load_scene("head_mounted").with_(gaze_deg=(5.0, 3.0)).spec
     posed.dump(tmp_path / "posed.yaml")
     assert run(["budget", str(tmp_path / "posed.yaml"), "--estimator", "regression"]) == 2

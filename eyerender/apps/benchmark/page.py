@@ -90,13 +90,18 @@ def _cards(data: Row) -> list[Card]:
     if edge["n"]:
         text = f"noise / pupil-iris step (DN of 8 bits) / sigma of the blurred edge (px), medians; {edge['source']}"
         cards.append(Card(f"{edge['noise_dn']:.2f} / {edge['step_dn']:.1f} / {edge['sigma_px']:.2f}", text))
+    common = data["common"]
+    if common["n"]:
+        medians = {name: e["centre_px"]["median"] for name, e in common["extractors"].items()}
+        least = min(medians, key=lambda name: medians[name])
+        text = f"least median centre error on the {common['n']} pupils that all of them find right: {least}"
+        cards.append(Card(f"{medians[least]:.4f} px", text))
     if best:
-        least = min(best, key=lambda e: e["summary"]["centre_px"]["median"])
-        cards.append(
-            Card(f"{least['summary']['centre_px']['median']:.4f} px", f"least median centre error: {least['name']}")
-        )
         most = max(best, key=lambda e: e["summary"]["rates"]["right"])
-        cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right: {most['name']}"))
+        span = _span(
+            most["summary"]["intervals"]["right"]["subjects"] or most["summary"]["intervals"]["right"]["wilson"]
+        )
+        cards.append(Card(_percent(most["summary"]["rates"]["right"]), f"most pupils right ({span}): {most['name']}"))
     return cards
 
 

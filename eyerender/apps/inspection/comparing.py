@@ -18,7 +18,7 @@ from .reading import Contents
 
 _CRITICAL = 1.36
 _LEAST = 5
-_LEVELS = np.linspace(0.0, 1.0, 129)
+_LEVELS = np.linspace(0.0, 1.0, 257)
 _DEALS = 400
 
 
@@ -86,21 +86,22 @@ def distance_and_chance(first: tuple[Floats, Ints], second: tuple[Floats, Ints])
         first: numbers (n,), and the unit of each (n,), counted from 0.
         second: those of the other dataset.
     """
-    distance = float(ks_2samp(first[0], second[0], method="asymp").statistic)
     sizes = [int(units.max()) + 1 for _, units in (first, second)]
     if all(size == len(values) for size, (values, _) in zip(sizes, (first, second), strict=True)):
+        distance = float(ks_2samp(first[0], second[0], method="asymp").statistic)
         return distance, min(_CRITICAL * math.sqrt(sum(sizes) / math.prod(sizes)), 1.0)
     levels = np.unique(np.quantile(np.concatenate([first[0], second[0]]), _LEVELS, method="inverted_cdf"))
     below = np.zeros((sum(sizes), len(levels)), np.float32)  # numbers of each unit up to each level
     for start, (values, units) in zip((0, sizes[0]), (first, second), strict=True):
         np.add.at(below, (start + units, np.searchsorted(levels, values)), 1)
-    below = np.cumsum(below, axis=1)
-    dealt = np.zeros((_DEALS, sum(sizes)), np.float32)
+    np.cumsum(below, axis=1, out=below)
+    dealt = np.zeros((_DEALS + 1, sum(sizes)), np.float32)  # the first one is as the datasets are
     dealt[:, : sizes[0]] = 1
-    mine = np.random.default_rng(0).permuted(dealt, axis=1, out=dealt) @ below
+    np.random.default_rng(0).permuted(dealt[1:], axis=1, out=dealt[1:])
+    mine = dealt @ below
     other = below.sum(axis=0) - mine
     distances = np.abs(mine / mine[:, -1:] - other / other[:, -1:]).max(axis=1)
-    return distance, float(np.quantile(distances, 0.95, method="higher"))
+    return float(distances[0]), float(np.quantile(distances[1:], 0.95, method="higher"))
 
 
 def shares(first: Contents, second: Contents) -> list[tuple[str, float, Sequence[tuple[str, float, float]]]]:
