@@ -79,17 +79,19 @@ def has_subjects(contents: Contents) -> bool:
 def distance_and_chance(first: tuple[Floats, Ints], second: tuple[Floats, Ints]) -> tuple[float, float]:
     """Compute the Kolmogorov-Smirnov distance of two samples, and the distance that chance exceeds in 5 % of cases.
 
-    With one number per unit, chance is 1.36 sqrt((n + m) / (n m)). Numbers of one unit are not independent, so
-    otherwise the units are dealt to the two datasets at random, and chance is the 95th percentile of the distances.
+    With independent numbers, chance is 1.36 sqrt((n + m) / (n m)). Where units have several numbers, the units are also
+    dealt to the two datasets at random, and chance is the 95th percentile of the distances if that is larger. It is
+    smaller where draws of a dataset are spread evenly (Sobol, grids).
 
     Args:
         first: numbers (n,), and the unit of each (n,), counted from 0.
         second: those of the other dataset.
     """
     sizes = [int(units.max()) + 1 for _, units in (first, second)]
-    if all(size == len(values) for size, (values, _) in zip(sizes, (first, second), strict=True)):
-        distance = float(ks_2samp(first[0], second[0], method="asymp").statistic)
-        return distance, min(_CRITICAL * math.sqrt(sum(sizes) / math.prod(sizes)), 1.0)
+    counts = len(first[0]), len(second[0])
+    chance = min(_CRITICAL * math.sqrt(sum(counts) / math.prod(counts)), 1.0)
+    if sum(sizes) == sum(counts):
+        return float(ks_2samp(first[0], second[0], method="asymp").statistic), chance
     levels = np.unique(np.quantile(np.concatenate([first[0], second[0]]), _LEVELS, method="inverted_cdf"))
     below = np.zeros((sum(sizes), len(levels)), np.float32)  # numbers of each unit up to each level
     for start, (values, units) in zip((0, sizes[0]), (first, second), strict=True):
@@ -101,7 +103,7 @@ def distance_and_chance(first: tuple[Floats, Ints], second: tuple[Floats, Ints])
     mine = dealt @ below
     other = below.sum(axis=0) - mine
     distances = np.abs(mine / mine[:, -1:] - other / other[:, -1:]).max(axis=1)
-    return float(distances[0]), float(np.quantile(distances[1:], 0.95, method="higher"))
+    return float(distances[0]), max(chance, float(np.quantile(distances[1:], 0.95, method="higher")))
 
 
 def shares(first: Contents, second: Contents) -> list[tuple[str, float, Sequence[tuple[str, float, float]]]]:
