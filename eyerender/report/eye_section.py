@@ -40,8 +40,8 @@ def _draw(ax: Any, eye: EyeModel, across: int) -> None:
     for k, surface in enumerate(eye.front):
         rim = _axis_distance(surface, x, s, across) <= eye.limbus_radius_mm
         if k:  # the back of the cornea ends at the iris
-            normal, centre = eye.stop.normal, eye.stop.centre_mm
-            rim &= x >= centre[0] - (s - centre[across]) * normal[across] / normal[0]
+            normal, stop = eye.stop.normal, eye.stop.centre_mm
+            rim &= x >= stop[0] - (s - stop[across]) * normal[across] / normal[0]
         _curve(ax, surface, x, s, across, rim, _CORNEA, 1.8, "cornea" if k == 0 else None)
     shells = eye.shelled()
     # A gradient lens has dozens of shells, so they get a grid that is no larger than they are.
@@ -93,12 +93,14 @@ def _axis_distance(surface: Surface, x: Floats, s: Floats, across: int) -> Float
 
 
 def _iris(ax: Any, eye: EyeModel, across: int) -> None:
-    """Draw the iris and the gap of the pupil in the section's plane."""
+    """Draw the iris and the gap of the pupil in the section's plane, through the pupil's centre."""
     stop = eye.stop
-    axis = np.asarray(stop.rotation)[:, across]
-    edge = float(stop.semi_axes_mm[across - 1])
+    margin = stop.boundary(720) - stop.centre_mm
+    axis = np.cross(np.eye(3)[3 - across], stop.normal)
+    axis /= np.linalg.norm(axis)
     for sign in (-1, 1):
-        line = np.stack([stop.centre_mm + sign * r * axis for r in (edge, eye.iris_root_radius_mm)])
+        edge = margin[np.argmax(margin @ (sign * axis) / np.linalg.norm(margin, axis=1))]
+        line = np.stack([stop.centre_mm + sign * r * axis for r in (np.linalg.norm(edge), eye.iris_root_radius_mm)])
         ax.plot(
             line[:, 0], line[:, across], color=_IRIS, lw=3, solid_capstyle="butt", label="iris" if sign > 0 else None
         )
