@@ -243,7 +243,7 @@ BOUNDS = {
     "apps": 16300,
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2560,  # one door for child processes and stored files; arguments of public functions checked, for all users
-    "cli": 2530,  # tables of features, targets and gaze from the command line
+    "cli": 2560,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
     "dataset": 9910,
     "design": 2810,
     "extraction": 7250,
@@ -253,7 +253,7 @@ BOUNDS = {
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,
-    "region": 4020,
+    "region": 4095,  # heads from STL and GLB files of any tool, with all mistakes named at once
     "rendering": 12520,
     "report": 970,
     "rig": 3130,  # cameras and LEDs that serve one eye: headsets; exposure set by the lights

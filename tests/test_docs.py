@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -165,3 +166,8 @@ def test_the_first_hour_leaves_no_file_in_the_checkout():
     environment = next(line.split()[-1] for line in lines if "-m venv" in line)
     for place in ("out/first_hour/x", f"{environment}/x"):
         assert subprocess.run(["git", "check-ignore", "-q", place], cwd=ROOT, check=False).returncode == 0, place
+
+
+def test_one_script_makes_every_picture():
+    given = runpy.run_path(str(ROOT / "scripts" / "tools" / "make_docs_pictures.py"))
+    assert set(given["PICTURES"]) == {path.name for path in (DOCS / "images").iterdir()}

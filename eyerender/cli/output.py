@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from threading import Timer
 from typing import TYPE_CHECKING, Any
 
 from ..base.errors import InputWarning
@@ -16,6 +17,8 @@ from ..base.storage.files import printable, write_json
 
 if TYPE_CHECKING:
     from ..scene import Scene
+
+PATIENCE_S = 2.0
 
 
 def say(text: str) -> None:
@@ -69,7 +72,10 @@ def emit(data: dict[str, Any], text: str, target: str | None, heed: Heed | None 
 
 @contextmanager
 def progress(what: str) -> Iterator[Progress]:
-    """Show progress on stderr during the block: a bar on a terminal, otherwise a line about every two seconds."""
+    """Show progress on stderr during the block: a bar on a terminal, otherwise a line about every two seconds.
+
+    The line for 0 items is written only if nothing else happens in the first `PATIENCE_S` seconds.
+    """
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -81,11 +87,21 @@ def progress(what: str) -> Iterator[Progress]:
             yield lambda done, total, note: bar.update(task, completed=done, total=total, description=f"{what}: {note}")
         return
     last = [time.monotonic() - 10.0]
+    first: list[Timer] = []  # says what is awaited, if the first item takes long
 
     def line(done: int, total: int, note: str) -> None:
-        now = time.monotonic()
-        if done in (0, total) or now - last[0] >= 2:
+        text, now = f"{what}: {done}/{total} {note}", time.monotonic()
+        for timer in first:
+            timer.cancel()
+        if done == 0:
+            first.append(Timer(PATIENCE_S, say, [text]))
+            first[-1].start()
+        elif done == total or now - last[0] >= 2:
             last[0] = now
-            say(f"{what}: {done}/{total} {note}")
+            say(text)
 
-    yield line
+    try:
+        yield line
+    finally:
+        for timer in first:
+            timer.cancel()

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +20,14 @@ import numpy as np
 from PIL import Image
 
 from ..base.arrays import ArrayValue, Floats, Ints, Singles, frozen
-from ..base.errors import InputError
+from ..base.errors import InputError, Problems
 from ..base.spec import file_digest
-from ..base.storage.files import opened, read_bytes, shown
-from ..optics.ply import plain_ply
+from ..base.storage.files import opened, shown
 from .anatomy import Region
 from .globe import Globe
 from .headspec import Head
 from .mesh import PARTS, RegionLayout, RegionMesh
+from .meshfile import read_objects
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,6 +36,10 @@ HEAD_PARTS = (*PARTS, "head")
 _UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 # These are the sizes of a patch around one eye and of a head with shoulders. Outside of them the unit is wrong.
 _SMALLEST_MM, _LARGEST_MM = 15.0, 1500.0
+# A head in cm, read as mm, is as large as a patch; without a stated unit it is refused.
+_SMALLEST_UNSTATED_MM = 60.0
+# The skin within this distance of the globe's centre lies before it, on average.
+_AROUND_MM, _BEHIND_MM = 30.0, 3.0
 _NEAR_MM = 40.0
 _PAD, _BAND, _PLAIN = 4, 8, 8
 _TEXTURE = 2048
@@ -77,7 +80,7 @@ def load_head(spec: Head) -> HeadMesh:
 
     Raises:
         InputError: a file is missing, unreadable or has another checksum; a part does not exist; numbers are not
-            finite; the size does not fit the unit.
+            finite; the size does not fit the unit; an eye is far away, or the head is turned backwards.
     """
     if spec.manifest:
         raise InputError("is a manifest; call resolve on it first", source=spec.files[0])
@@ -98,18 +101,14 @@ def file_states(spec: Head) -> tuple[tuple[int, int], ...]:
     return tuple(states)
 
 
-def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
-    """Read the meshes of all files, by name.
-
-    Raises:
-        InputError: a checksum is wrong.
-    """
+def _all_objects(spec: Head, problems: Problems) -> dict[str, list[trimesh.Trimesh]]:
+    """Read the meshes of all files, by name."""
     for file, wanted in zip(spec.files, spec.sums, strict=False):
         if file_digest(Path(file)) != wanted:
-            raise InputError("does not have the given sha256", source=file)
+            problems.add("does not have the given sha256", Path(file).name)
     objects: dict[str, list[trimesh.Trimesh]] = {}
     for file in spec.files:
-        for name, mesh in _objects(Path(file)).items():
+        for name, mesh in read_objects(Path(file)):
             objects.setdefault(name, []).append(mesh)
     return objects
 
@@ -118,12 +117,13 @@ def _all_objects(spec: Head) -> dict[str, list[trimesh.Trimesh]]:
 def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
     del states
     source = spec.files[0]
-    objects = _all_objects(spec)
-    scale, axes = _UNIT_MM[spec.unit or "mm"], _axes(spec, source)
+    problems = Problems(source)
+    objects = _all_objects(spec, problems)
+    scale, axes = spec.unit_mm, _axes(spec)
     vertices, normals, faces, uv, vertex_ends, face_ends = [], [], [], [], [], []
     count = triangles = 0
     for part in HEAD_PARTS:
-        names = _named(spec, part, objects, source)
+        names = _named(spec, part, objects, problems)
         for mesh in (m for name in names for m in objects[name]):
             v = np.asarray(mesh.vertices, dtype=float)
             vertices.append(scale * v @ axes.T)
@@ -134,16 +134,19 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
             triangles += len(mesh.faces)
         vertex_ends.append(count)
         face_ends.append(triangles)
-    if not faces:
+    if not faces and not problems:
         raise InputError("does not name any object of the mesh", source=source, path="parts")
-    joined = np.concatenate(vertices)
-    size = float(np.linalg.norm(np.ptp(joined, axis=0)))
-    if not _SMALLEST_MM <= size <= _LARGEST_MM:
-        raise InputError(f"with unit {spec.unit}, the mesh is {size:.1f} mm large", source=source, path="unit")
-    eyes = [np.full(3, np.nan) if e is None else scale * axes @ np.array(e) for e in (spec.right_eye, spec.left_eye)]
-    for name, eye in zip(("right_eye", "left_eye"), eyes, strict=True):
-        if np.all(np.isfinite(eye)) and (gap := float(np.min(np.linalg.norm(joined - eye, axis=1)))) > _NEAR_MM:
-            raise InputError(f"is {gap:.1f} mm away from the nearest vertex", source=source, path=name)
+    joined = np.concatenate(vertices) if vertices else np.zeros((0, 3))
+    eyes = {
+        name: np.full(3, np.nan) if eye is None else scale * axes @ np.array(eye)
+        for name, eye in (("right_eye", spec.right_eye), ("left_eye", spec.left_eye))
+    }
+    if len(joined):
+        _check_size(spec, joined, problems)
+    for name, eye in eyes.items():
+        if not problems and np.isfinite(eye).all():
+            _check_eye(name, eye, joined, problems)
+    problems.check()
     return HeadMesh(
         vertices=frozen(joined),
         normals=frozen(np.concatenate(normals)),
@@ -151,8 +154,8 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
         uv=frozen(np.concatenate(uv)),
         vertex_ends=frozen(vertex_ends, np.int64),
         face_ends=frozen(face_ends, np.int64),
-        right_eye=frozen(eyes[0]),
-        left_eye=frozen(eyes[1]),
+        right_eye=frozen(eyes["right_eye"]),
+        left_eye=frozen(eyes["left_eye"]),
     )
 
 
@@ -255,67 +258,44 @@ def _picture(path: Path, changed_ns: int) -> Floats:
     return frozen(np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4))
 
 
-def _objects(path: Path) -> dict[str, trimesh.Trimesh]:
-    """Read the named objects of a file: an OBJ's objects, or its groups if it has none; a PLY under its stem."""
-    import trimesh  # its import takes a quarter of a second, and few processes need it
-
-    source, kind = str(path), path.suffix.lower()
-    if kind not in (".obj", ".ply"):
-        raise InputError("must end with .obj or .ply", source=source)
-    # Without its materials a file refers to no other files.
-    options: dict[str, Any] = {"skip_materials": True}
-    data = read_bytes(path) if kind == ".obj" else plain_ply(read_bytes(path), source=source)
-    try:
-        if kind == ".obj":
-            text = "\n" + data.decode("utf-8", errors="replace")
-            divided = "split_objects" if "\no " in text else "split_groups"
-            options |= {"group_material": False, divided: True}
-            if "\no " not in text and "\ng " not in text:
-                options.pop(divided)
-        scene = trimesh.load_scene(BytesIO(data), file_type=kind[1:], process=False, **options)
-        found = {name: g for name, g in scene.geometry.items() if isinstance(g, trimesh.Trimesh) and len(g.faces)}
-    except Exception as error:
-        # Mesh readers may raise any exception for a broken file.
-        detail = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"is not a readable mesh ({detail})", source=source) from None
-    if not found:
-        raise InputError("holds no triangles", source=source)
-    for name, mesh in found.items():
-        _check(mesh, shown(name), source)
-    if kind == ".ply" or not options.keys() & {"split_objects", "split_groups"}:
-        return {path.stem: next(iter(found.values()))}
-    return found
-
-
-def _check(mesh: trimesh.Trimesh, name: str, source: str) -> None:
-    v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    if v.shape[1:] != (3,):
-        raise InputError(f"object {name} has vertices without three coordinates", source=source)
-    if not np.all(np.isfinite(v)):
-        raise InputError(f"object {name} holds coordinates that are not finite", source=source)
-    if f.min() < 0 or f.max() >= len(v):
-        raise InputError(f"object {name} has faces without vertices", source=source)
-
-
-def _named(spec: Head, part: str, objects: dict[str, Any], source: str) -> tuple[str, ...]:
+def _named(spec: Head, part: str, objects: dict[str, Any], problems: Problems) -> tuple[str, ...]:
     if spec.parts is None:
         return tuple(objects) if part == "skin" else ()
     names: tuple[str, ...] = getattr(spec.parts, part)
     for name in names:
         if name not in objects:
-            raise InputError(
-                f"no object {shown(name)}; there are {', '.join(sorted(objects))}", source=source, path=f"parts.{part}"
-            )
-    return names
+            problems.add(f"no object {shown(name)}; there are {', '.join(sorted(objects))}", f"parts.{part}")
+    return tuple(name for name in names if name in objects)
 
 
-def _axes(spec: Head, source: str) -> Floats:
-    forward, up = np.array(spec.forward), np.array(spec.up)
-    left = np.cross(up, forward)
-    if np.linalg.norm(left) <= 1e-6 * np.linalg.norm(up) * np.linalg.norm(forward):
-        raise InputError("must not be zero or parallel to forward", source=source, path="up")
+def _axes(spec: Head) -> Floats:
+    """Return the rows forward, left and up of the head in the files' axes."""
+    forward = np.array(spec.forward)
+    left = np.cross(spec.up, forward)
     forward, left = forward / np.linalg.norm(forward), left / np.linalg.norm(left)
     return np.stack([forward, left, np.cross(forward, left)])
+
+
+def _check_size(spec: Head, vertices: Floats, problems: Problems) -> None:
+    """Check the size of the mesh, mm: with a stated unit, of a patch around an eye or of a head with shoulders."""
+    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not (_SMALLEST_MM if spec.unit else _SMALLEST_UNSTATED_MM) <= size <= _LARGEST_MM:
+        fits = [unit for unit, mm in _UNIT_MM.items() if 100.0 <= size / spec.unit_mm * mm <= _LARGEST_MM]
+        hint = f"; unit: {fits[0]} would fit" if fits else ""
+        problems.add(f"with unit {spec.unit or 'not stated'}, the mesh is {size:.1f} mm large{hint}", "unit")
+
+
+def _check_eye(name: str, eye: Floats, vertices: Floats, problems: Problems) -> None:
+    """Check that an eye lies near the mesh, and behind the skin around it."""
+    distance = np.linalg.norm(vertices - eye, axis=1)
+    if distance.min() > _NEAR_MM:
+        problems.add(f"is {distance.min():.1f} mm away from the nearest vertex", name)
+    near = vertices[distance < _AROUND_MM, 0] - eye[0]
+    if len(near) and near.mean() < -_BEHIND_MM:
+        reason = (
+            f"points backwards: the mesh around {name} lies {-near.mean():.0f} mm behind the globe's centre on average"
+        )
+        problems.add(reason, "forward")
 
 
 def _smooth(vertices: Floats, faces: Ints) -> Floats:

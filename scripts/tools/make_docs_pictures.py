@@ -1,8 +1,10 @@
-"""Make the pictures of the README and of the tour: rendered eyes, a rig, an eye's section, a contact sheet, a report.
+"""Make every picture of docs/images, which the README and the pages show, or those that are named.
 
-python scripts/tools/make_docs_pictures.py [FOLDER]      (default: docs/images)
+python scripts/tools/make_docs_pictures.py [NAME ...] [-o FOLDER]      (default: all, docs/images)
 
-The report's picture needs PySide6, in this environment or in that of the Python that DOCS_BROWSER_PYTHON names.
+Pictures of reports need PySide6, in this environment or in that of the Python that DOCS_BROWSER_PYTHON names; that of
+the live page needs Chromium with its driver, and selenium. Pictures that cannot be made here are named at the end, and
+the exit code is 1. All take about ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -11,6 +13,9 @@ import argparse
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -78,7 +83,6 @@ def picture(scene: er.Scene, fixation: int, eye: int, crop: tuple[int, int], pat
     found = er.ImageObserver().observe_images([image])
     full = scene.spec.sensor.full_scale_dn
     draw(image.counts, image.window[:2], full, truth, found, 0, crop, path)
-    print(path)
 
 
 def labels(path: Path) -> None:
@@ -108,40 +112,134 @@ def shrunk(source: Path, path: Path, width: int, colours: int = 64) -> None:
     small.save(path, quality=82, optimize=True)
 
 
-def screenshot(page: Path, path: Path) -> None:
-    """The top of an HTML page as a browser shows it (PySide6, which only this needs)."""
+def screenshot(page: Path, path: Path, height: int = 900, heading: str = "") -> None:
+    """An HTML page as a browser shows it, from the heading on if one is given (PySide6, which only this needs)."""
     code = (
         "import sys; from PySide6.QtCore import QTimer, QUrl; from PySide6.QtWidgets import QApplication;"
         "from PySide6.QtWebEngineWidgets import QWebEngineView;"
-        "app = QApplication(sys.argv); view = QWebEngineView(); view.resize(1100, 900); view.show();"
+        "app = QApplication(sys.argv); view = QWebEngineView(); view.resize(1100, int(sys.argv[3])); view.show();"
+        "scroll = 'for (const h of document.querySelectorAll(\\'h2\\')) "
+        "if (h.textContent === \\'' + sys.argv[4] + '\\') window.scrollTo(0, h.getBoundingClientRect().top - 8)';"
         "save = lambda: (view.grab().save(sys.argv[2]), app.quit());"
-        "view.loadFinished.connect(lambda ok: QTimer.singleShot(1500, save));"
-        "view.load(QUrl.fromLocalFile(sys.argv[1])); app.exec()"
+        "show = lambda ok: (view.page().runJavaScript(scroll), QTimer.singleShot(1500, save));"
+        "view.loadFinished.connect(show); view.load(QUrl.fromLocalFile(sys.argv[1])); app.exec()"
     )
     flags = {"QT_QPA_PLATFORM": "offscreen", "QTWEBENGINE_CHROMIUM_FLAGS": "--no-sandbox --disable-gpu"}
     browser = os.environ.get("DOCS_BROWSER_PYTHON", sys.executable)
-    subprocess.run([browser, "-c", code, str(page), str(path)], env={**os.environ, **flags}, check=True)
+    if subprocess.run(
+        [browser, "-c", "import PySide6.QtWebEngineWidgets"], capture_output=True, check=False
+    ).returncode:
+        raise MissingBrowserError("PySide6")
+    command = [browser, "-c", code, str(page), str(path), str(height), heading]
+    subprocess.run(command, env={**os.environ, **flags}, check=True)
 
 
-def main(out: Path) -> None:
-    """Make all pictures."""
+class MissingBrowserError(Exception):
+    """No browser to show a page."""
+
+
+def view(what: str, name: str, path: Path, scratch: Path) -> None:
+    """An eye or a rig as `eyerender view` draws it."""
+    run(["view", what, name, "-o", str(scratch / "view.png")])
+    shrunk(scratch / "view.png", path, 900)
+
+
+def sheet(spec: str, path: Path, scratch: Path, *, width: int = 900, rows: int | None = None) -> None:
+    """The contact sheet of a dataset's spec, or its first rows of tiles."""
+    er.preview(spec, scratch / "sheet.png")
+    if rows is not None:
+        with Image.open(scratch / "sheet.png") as whole:
+            # The preview has sixteen tiles in four columns, with a gap below each row and above the first.
+            whole.crop((0, 0, whole.width, (whole.height - 4) * rows // 4)).save(scratch / "sheet.png")
+    shrunk(scratch / "sheet.png", path, width)
+
+
+def quickstart(path: Path, scratch: Path) -> None:
+    """The top of the quickstart's report."""
+    er.apps.run_quickstart(scratch / "quickstart")
+    screenshot(scratch / "quickstart" / "report.html", scratch / "page.png")
+    shrunk(scratch / "page.png", path, 800)
+
+
+def rig(path: Path, scratch: Path) -> None:
+    """The maps of the report on a rig."""
+    run(["rig", "headset", "-o", str(scratch / "rig"), "--people", "40", "--sample", "1"])
+    screenshot(scratch / "rig" / "report.html", scratch / "page.png", 385, "Where does the rig see well?")
+    shrunk(scratch / "page.png", path, 900)
+
+
+def live(path: Path, scratch: Path) -> None:
+    """The live page of the headset."""
+    from _browser import chromium, find_chromium, live_server, pictured, until
+
+    if find_chromium() is None:
+        raise MissingBrowserError("Chromium with chromedriver")
+    with live_server("headset") as server, chromium(1280, 760) as driver:
+        driver.get(server.address)
+        until(lambda: pictured(driver))
+        time.sleep(20)  # the picture is refined while nothing changes
+        driver.save_screenshot(str(scratch / "page.png"))
+    shrunk(scratch / "page.png", path, 1280)
+
+
+def convention(name: str, path: Path, _scratch: Path) -> None:
+    """A figure of the page of conventions."""
+    from docs.tools import figures
+
+    getattr(figures, name)(path)
+
+
+def mesh_curve(path: Path, _scratch: Path) -> None:
+    """The errors of meshed corneas."""
+    subprocess.run([sys.executable, str(ROOT / "scripts" / "tools" / "make_mesh_curve.py"), str(path)], check=True)
+
+
+def feature_picture(name: str, crop: tuple[int, int], path: Path, _scratch: Path) -> None:
+    """The features of a scene's central fixation."""
+    picture(er.load_scene(name, spp=64), 4, 0, crop, path)
+
+
+PICTURES: dict[str, Callable[[Path, Path], None]] = {
+    "head_mounted.jpg": partial(feature_picture, "headset", (624, 468)),
+    "remote.jpg": partial(feature_picture, "desktop_tracker", (312, 234)),
+    "labels.jpg": lambda path, _scratch: labels(path),
+    "view_eye.png": partial(view, "eye", "E4"),
+    "view_scene.png": partial(view, "scene", "desktop_tracker"),
+    "frames.png": partial(convention, "frames"),
+    "eye_angles.png": partial(convention, "eye_angles"),
+    "pixels.png": partial(convention, "pixels"),
+    "sheet.jpg": partial(sheet, "dataset_region", width=840),
+    **{
+        f"{name}.jpg": partial(sheet, name, rows=2)
+        for name in ("people_openeds", "people_nvgaze", "people_pupil_core", "people_eyelink", "people_iris_camera")
+    },
+    "mesh_curve.png": mesh_curve,
+    "report.jpg": quickstart,
+    "rig.jpg": rig,
+    "live.jpg": live,
+}
+"""Every file of docs/images, and what makes it from its path and a scratch folder."""
+
+
+def main(names: list[str], out: Path) -> int:
+    """Make pictures; return 1 if a browser is missing for some."""
     out.mkdir(parents=True, exist_ok=True)
-    picture(er.load_scene("headset", spp=64), 4, 0, (624, 468), out / "head_mounted.jpg")
-    picture(er.load_scene("desktop_tracker", spp=64), 4, 0, (312, 234), out / "remote.jpg")
-    labels(out / "labels.jpg")
-    with TemporaryDirectory() as folder:
-        scratch = Path(folder)
-        for what, name in (("eye", "E4"), ("scene", "desktop_tracker")):
-            run(["view", what, name, "-o", str(scratch / f"{what}.png")])
-            shrunk(scratch / f"{what}.png", out / f"view_{what}.png", 900)
-        er.preview("dataset_region", scratch / "sheet.png")
-        shrunk(scratch / "sheet.png", out / "sheet.jpg", 840)
-        er.apps.run_quickstart(scratch / "quickstart")
-        screenshot(scratch / "quickstart" / "report.html", scratch / "report.png")
-        shrunk(scratch / "report.png", out / "report.jpg", 800)
+    missing = 0
+    for name in names or PICTURES:
+        with TemporaryDirectory() as scratch:
+            try:
+                PICTURES[name](out / name, Path(scratch))
+                print(out / name, flush=True)
+            except MissingBrowserError as browser:
+                print(f"{name} is not renewed: it needs {browser}", file=sys.stderr)
+                missing = 1
+    return missing
 
 
 if __name__ == "__main__":
+    sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]  # for `docs.tools` and the browser
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "docs" / "images")
-    main(parser.parse_args().folder)
+    parser.add_argument("names", nargs="*", choices=[[], *PICTURES], metavar="NAME", help="such as view_eye.png")
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "images")
+    given = parser.parse_args()
+    sys.exit(main(given.names, given.output))

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import struct
+import time
 
 import numpy as np
 import pytest
 import trimesh
+import yaml
+from PIL import Image
 
+import eyerender as er
 from eyerender.base.errors import InputError
+from eyerender.cli.main import run
 from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
@@ -174,3 +181,152 @@ def test_a_mesh_leads_to_no_other_file(tmp_path, comment, caplog):
         assert len(load_head(spec_of(tmp_path, file=name)).faces) == len(mesh.faces)
     # What trimesh logs as a warning, with a traceback, Python prints where nobody has set up logging.
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+def command(folder, **head):
+    """Render a scene with a head mesh by the command line; return the exit code."""
+    keys = {"file": "head.obj", "forward": [1, 0, 0], "right_eye": [72.0, 20.0, 31.0], **head}
+    scene = {
+        **er.load_scene("head_mounted").spec.to_mapping(),
+        "region": {"head": {k: v for k, v in keys.items() if v}},
+    }
+    (folder / "scene.yaml").write_text(yaml.safe_dump(scene))
+    return run(["render", str(folder / "scene.yaml"), "-o", str(folder / "out"), "--overwrite"])
+
+
+def two_parts():
+    """A shell in two objects that overlap nowhere, one moved within the file."""
+    face = trimesh.creation.icosphere(subdivisions=3)
+    face.apply_scale([90.0, 110.0, 70.0])
+    away = np.eye(4)
+    away[:3, 3] = [-40.0, 60.0, 5.0]
+    scene = trimesh.Scene()
+    scene.add_geometry(face, node_name="Face", geom_name="FaceMesh")
+    scene.add_geometry(trimesh.creation.icosphere(radius=20.0), node_name="Hair", geom_name="HairMesh", transform=away)
+    return scene
+
+
+FORMATS = {
+    "head.obj": {"file_type": "obj"},
+    "head.stl": {"file_type": "stl"},
+    "ascii.stl": {"file_type": "stl_ascii"},
+    "head.ply": {"file_type": "ply"},
+    "ascii.ply": {"file_type": "ply", "encoding": "ascii"},
+    "head.glb": {"file_type": "glb"},
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_head(tmp_path, name):
+    """As trimesh writes it, with neither unit nor licence; glTF's unit is the metre."""
+    whole = two_parts().to_mesh()
+    if name == "head.glb":
+        whole.apply_scale(1e-3)
+    data = whole.export(**FORMATS[name])
+    (tmp_path / name).write_bytes(data.encode() if isinstance(data, str) else data)
+    eye = [72.0, 20.0, 31.0] if name != "head.glb" else [0.072, 0.02, 0.031]
+    head = load_head(spec_of(tmp_path, file=name, unit=None, licence=None, right_eye=eye))
+    exact = two_parts().to_mesh()
+    assert len(head.faces) == len(exact.faces)
+    corners = exact.triangles @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # forward is x, left is -z, up is y
+    np.testing.assert_allclose(head.vertices[head.faces], corners, atol=1e-4)
+    assert np.linalg.norm(head.normals, axis=1) == pytest.approx(1.0)
+
+
+def test_nodes_of_a_glb_are_parts_in_their_places(tmp_path):
+    scene = two_parts()
+    scene.apply_scale(1e-3)
+    uv = np.random.default_rng(0).uniform(size=(len(scene.geometry["FaceMesh"].vertices), 2))
+    picture = Image.fromarray(np.zeros((4, 4, 3), np.uint8))
+    scene.geometry["FaceMesh"].visual = trimesh.visual.TextureVisuals(uv=uv, image=picture)
+    (tmp_path / "head.glb").write_bytes(scene.export(file_type="glb"))
+    parts = {"skin": ["Face"], "head": ["Hair"]}
+    keys = {"file": "head.glb", "unit": None, "right_eye": [0.072, 0.02, 0.031]}
+    head = load_head(spec_of(tmp_path, **keys, parts=parts))
+    hair = head.vertices[head.vertex_ends[-2] :]
+    np.testing.assert_allclose(hair.mean(axis=0), [-40.0, -5.0, 60.0], atol=1e-3)
+    np.testing.assert_allclose(head.uv[: len(uv)], uv, atol=1e-6)
+    with pytest.raises(InputError, match=r"parts.skin: no object 'Nose'; there are Face, Hair"):
+        load_head(spec_of(tmp_path, **keys, parts={"skin": ["Nose"]}))
+
+
+def test_all_mistakes_are_reported_at_once(tmp_path, capsys):
+    shell(tmp_path / "head.obj")
+    assert command(tmp_path, unit="inch", forward=[0, 1, 0], up=[0, -2, 0], right_eye=None, tolerance_mm=-1) == 2
+    lines = capsys.readouterr().err
+    for key in ("unit: must be", "up: must not be zero or parallel to forward", "left_eye: missing", "tolerance_mm"):
+        assert f"region.head.{key}" in lines
+    assert command(tmp_path, unit="m", parts={"skin": ["x"], "brow": ["y"], "head": ["head"]}, sha256="0" * 64) == 2
+    lines = capsys.readouterr().err
+    for words in ("sha256", "parts.skin: no object 'x'", "parts.brow: no object 'y'", "unit: with unit m"):
+        assert words in lines
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_head_turned_backwards_is_named(tmp_path, capsys):
+    shell(tmp_path / "head.obj")
+    assert command(tmp_path, forward=[-1, 0, 0]) == 2
+    (line,) = capsys.readouterr().err.splitlines()[-1:]
+    assert "head.obj: forward: points backwards: the mesh around right_eye lies" in line
+
+
+def test_a_head_in_another_unit_than_the_default_is_refused(tmp_path):
+    shell(tmp_path / "shell.ply", 0.1)
+    with pytest.raises(InputError, match=r"with unit not stated, the mesh is .* mm large; unit: cm would fit"):
+        load_head(spec_of(tmp_path, unit=None, right_eye=[7.2, 2.0, 3.1]))
+    load_head(spec_of(tmp_path, unit="cm", right_eye=[7.2, 2.0, 3.1]))
+
+
+GLB = {
+    "counts.glb": {"accessors": [{"componentType": 5125, "type": "SCALAR", "count": 10**11}]},
+    "copies.glb": {"nodes": [{"mesh": 0} for _ in range(10**5)]},
+    "draco.glb": {"extensionsRequired": ["KHR_draco_mesh_compression"]},
+    "deep.glb": {"nodes": 3, "meshes": [1], "buffers": [2], "accessors": [None]},
+}
+
+
+def hostile(kind):
+    """A file that would take a trusting reader minutes, or gigabytes."""
+    corner = "v 0 0 0\nv 40 0 0\nv 0 40 0\nv 0 0 30\n"
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 40 0 0\nvertex 0 40 0\nendloop\nendfacet\n"
+    if kind == "faces.obj":
+        return (corner + "f 1 2 3\nf 1 2 3 4\n" * 1_000_000).encode()
+    if kind == "objects.obj":
+        return (corner + "".join(f"o a{k}\nf 1 2 3\n" for k in range(100_000))).encode()
+    if kind == "solids.stl":
+        return (f"solid a\n{facet}endsolid\n" * 20_000).encode()
+    if kind == "large.stl":
+        return b"\0" * (33 * 2**20)
+    data = trimesh.creation.icosphere(subdivisions=1).export(file_type="glb")
+    length = struct.unpack("<I", data[12:16])[0]
+    whole = json.loads(data[20 : 20 + length])
+    whole |= GLB.get(kind, {})
+    if kind == "outside.glb":
+        whole["buffers"][0]["uri"] = "/etc/passwd"
+    text = json.dumps(whole).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    return struct.pack("<4sII I4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
+HOSTILE = {
+    "faces.obj": "holds 2000000 faces; at most 1000000 are read",
+    "objects.obj": "holds 100000 objects; at most 1000 are read",
+    "solids.stl": "objects; at most 1000 are read",
+    "large.stl": "is too large",
+    "counts.glb": "holds more numbers than bytes",
+    "outside.glb": "refers to other files; export it as one GLB file",
+    "copies.glb": "more than 1000 nodes",
+    "draco.glb": "needs extensions of glTF: .*draco.*; export it without compression",
+    "deep.glb": "is not a readable mesh",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_mesh_is_refused_quickly(tmp_path, name):
+    (tmp_path / name).write_bytes(hostile(name))
+    start = time.process_time()
+    with pytest.raises(InputError, match=HOSTILE[name]) as caught:
+        load_head(spec_of(tmp_path, file=name))
+    assert time.process_time() - start < 3
+    assert "\n" not in str(caught.value)

@@ -335,16 +335,17 @@ REFUSED = [
     ({"parts": {"skin": ["nose"]}}, "parts.skin: no object 'nose'; there are ball, bar, face"),
     ({"unit": "inch"}, "unit"),
     ({"unit": "m"}, "unit: with unit m, the mesh is 17000"),
-    ({"unit": None}, "unit: missing"),
-    ({"licence": None}, "licence: missing"),
+    ({"unit": None}, "unit: with unit not stated, the mesh is 17"),
     ({"right_eye": [30.0, 0.0, 0.0]}, "right_eye: is "),
-    ({"right_eye": None}, "right_eye: missing"),
+    ({"right_eye": None}, "left_eye: missing; give the centre of the right or of the left globe"),
+    ({"forward": [0.0, 0.0, -1.0]}, "forward: points backwards"),
     ({"up": [0.0, 0.0, 2.0]}, "up: must not be zero or parallel"),
     ({"file": "none.obj"}, "none.obj: no such file"),
     ({"file": "text.ply"}, "text.ply: is not a PLY file that can be read (its header does not begin or end)"),
     ({"file": "empty.obj"}, "empty.obj: "),
     ({"file": "hole.obj"}, "not finite"),
-    ({"file": "head.stl"}, "head.stl: must end with .obj or .ply"),
+    ({"file": "head.stl"}, "head.stl: holds no triangles"),
+    ({"file": "head.3ds"}, "head.3ds: must end with .obj, .stl, .ply, .glb"),
     ({"file": "other.json"}, "unit: belongs in the manifest"),
 ]
 
@@ -356,6 +357,7 @@ def test_mistakes_end_in_one_line(renderer, folder, change, words, capsys, monke
     Path("empty.obj").write_text("o face\nv 0 0 0\n")
     Path("hole.obj").write_text("o face\nv nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     Path("head.stl").write_text("solid")
+    Path("head.3ds").write_text("MM")
     head = {k: v for k, v in {**head_of(), **change}.items() if v is not None}
     Path("scene.yaml").write_text(yaml.safe_dump(scene_data(head)))
     assert run(["render", "scene.yaml", "-o", "out", "--threads", "1"]) == 2
