@@ -112,14 +112,15 @@ def shrunk(source: Path, path: Path, width: int, colours: int = 64) -> None:
     small.save(path, quality=82, optimize=True)
 
 
-def screenshot(page: Path, path: Path, height: int = 900, heading: str = "") -> None:
+def screenshot(page: Path, path: Path, size: tuple[int, int] = (1100, 900), heading: str = "") -> None:
     """An HTML page as a browser shows it, from the heading on if one is given (PySide6, which only this needs)."""
     code = (
         "import sys; from PySide6.QtCore import QTimer, QUrl; from PySide6.QtWidgets import QApplication;"
         "from PySide6.QtWebEngineWidgets import QWebEngineView;"
-        "app = QApplication(sys.argv); view = QWebEngineView(); view.resize(1100, int(sys.argv[3])); view.show();"
+        "app = QApplication(sys.argv); view = QWebEngineView(); view.resize(*map(int, sys.argv[3:5])); view.show();"
+        "view.settings().setAttribute(view.settings().WebAttribute.ShowScrollBars, False);"
         "scroll = 'for (const h of document.querySelectorAll(\\'h2\\')) "
-        "if (h.textContent === \\'' + sys.argv[4] + '\\') window.scrollTo(0, h.getBoundingClientRect().top - 8)';"
+        "if (h.textContent === \\'' + sys.argv[5] + '\\') window.scrollTo(0, h.getBoundingClientRect().top - 8)';"
         "save = lambda: (view.grab().save(sys.argv[2]), app.quit());"
         "show = lambda ok: (view.page().runJavaScript(scroll), QTimer.singleShot(1500, save));"
         "view.loadFinished.connect(show); view.load(QUrl.fromLocalFile(sys.argv[1])); app.exec()"
@@ -130,7 +131,7 @@ def screenshot(page: Path, path: Path, height: int = 900, heading: str = "") -> 
         [browser, "-c", "import PySide6.QtWebEngineWidgets"], capture_output=True, check=False
     ).returncode:
         raise MissingBrowserError("PySide6")
-    command = [browser, "-c", code, str(page), str(path), str(height), heading]
+    command = [browser, "-c", code, str(page), str(path), *map(str, size), heading]
     subprocess.run(command, env={**os.environ, **flags}, check=True)
 
 
@@ -164,7 +165,7 @@ def quickstart(path: Path, scratch: Path) -> None:
 def rig(path: Path, scratch: Path) -> None:
     """The maps of the report on a rig."""
     run(["rig", "headset", "-o", str(scratch / "rig"), "--people", "40", "--sample", "1"])
-    screenshot(scratch / "rig" / "report.html", scratch / "page.png", 385, "Where does the rig see well?")
+    screenshot(scratch / "rig" / "report.html", scratch / "page.png", (1250, 420), "Where does the rig see well?")
     shrunk(scratch / "page.png", path, 900)
 
 
