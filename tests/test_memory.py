@@ -129,7 +129,7 @@ def dataset_of(path, count, size):
     scene = {key: value for key, value in SCENE.items() if key not in ("format", "name")} | {
         "targets": {"grid": [1, 1]}
     }
-    spec = {"format": 2, "kind": "dataset", "name": "many", "count": count, "shard_size": size, "subjects": count // 10}
+    spec = {"format": 3, "kind": "dataset", "name": "many", "count": count, "shard_size": size, "subjects": count // 10}
     spec |= {"scene": scene | {"subject": {"eyes": ["right"]}}, "splits": {"train": 0.8, "test": 0.2}}
     plan = Plan.of(DatasetSpec.from_mapping(spec))
     (record,) = trace(plan.draw(0).build(), boundary_points=6).records()

@@ -40,7 +40,7 @@ def test_lights_without_an_aim_aim_at_the_nearest_eye(tmp_path):
     ("kind", "text", "found", "read"),
     [
         (SceneSpec, "name: old\nlens: {kind: 3}", 1, 2),
-        (DatasetSpec, "kind: dataset\nextends: nowhere.yaml", 1, 2),
+        (DatasetSpec, "kind: dataset\nextends: nowhere.yaml", 2, 3),
         (EyeSpec, "cornea: []\nlens: {index_rate: 2}", 1, 3),
         (EyeSpec, "cornea: []", 2, 3),
         (EyeSpec, "cornea: []", 4, 3),

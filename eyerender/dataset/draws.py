@@ -6,7 +6,12 @@ the template, the unit it belongs to (a sample or a subject) and the attempt:
     u = (m + 1/2) / 2^53,   m = the first 53 bits of SHA-256("seed/path/unit/number/attempt")
 
 It therefore depends neither on other draws nor on the process that makes the sample. Grids form one joint full
-factorial design. Sobol draws form one joint scrambled sequence (Owen 1998, as in `scipy.stats.qmc.Sobol`).
+factorial design.
+
+Sobol draws form one joint scrambled sequence (Owen 1998, as in `scipy.stats.qmc.Sobol`). Its points go to the first
+samples of all subjects, then to their second ones, and so on; each 16 in a row are permuted by a hash. So 16 subjects
+cover every range evenly, and no point depends on whether a sample's or a subject's number is even, nor on sequences.
+Each subject enters sequences at a place of its own; of n subjects in a row each enters one with n values elsewhere.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
@@ -25,6 +31,7 @@ from ..base.spec import Positive, Spec
 
 Unit = Literal["sample", "subject"]
 MARK = "draw"
+RUN = 16  # points of a Sobol sequence that are permuted
 # The largest numbers that may be drawn are Cauchy's coefficients of an eye's media; the largest integers are seeds.
 Drawn = Annotated[float, Field(ge=-1e20, le=1e20)]
 Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
@@ -210,7 +217,7 @@ class SobolDraw(_RangeDraw):
 
 
 class SequenceDraw(_Draw):
-    """Value number k for frame number k of a subject, cyclically: a fixation sequence."""
+    """Consecutive values for consecutive samples of a subject, cyclically; the first one differs between subjects."""
 
     draw: Literal["sequence"]
     values: Annotated[tuple[Any, ...], Field(min_length=1)]
@@ -261,6 +268,17 @@ def unit_number(seed: int, path: str, unit: str, number: int, attempt: int) -> f
     """Compute the number u in (0, 1) of a draw; see the module."""
     digest = hashlib.sha256(f"{seed}/{path}/{unit}/{number}/{attempt}".encode()).digest()
     return ((int.from_bytes(digest[:8], "big") >> 11) + 0.5) / 2.0**53
+
+
+def mixed(seed: int, what: str, number: int, run: int) -> int:
+    """Permute whole numbers within consecutive runs of `run`, in an order drawn for each run."""
+    first = number // run * run
+    return first + _order(seed, what, first, run)[number - first]
+
+
+@lru_cache(maxsize=4096)
+def _order(seed: int, what: str, first: int, run: int) -> list[int]:
+    return sorted(range(run), key=lambda k: unit_number(seed, what, "order", first + k, 0))
 
 
 def random_value(draw: Draw, u: float) -> Any:

@@ -331,12 +331,19 @@ class Plan:
             raise InputError(f"must be 0 to {spec.selection.end - 1}", source=str(sample))
         subject, sequence = self.subject_of(sample)
         subject_attempt = self.identity(subject)[0]
-        turn = Turn(sample=sample, subject=subject, sequence=sequence, attempt=attempt, subject_attempt=subject_attempt)
+        turn = Turn(
+            sample=sample,
+            subject=subject,
+            sequence=sequence,
+            attempt=attempt,
+            subject_attempt=subject_attempt,
+            place=spec.selection.place_of(sample),
+        )
         own = None if self.scenes is None else self.scenes.at(spec.seed, turn, self.base)
         if own is not None and own.subject is not None:
             turn = replace(turn, subject=own.subject, sequence=0)
         tree, drawn = self._scene_of(turn) if own is None else (dict(own.tree), own.draws)
-        tree.setdefault("format", spec.format)
+        tree.setdefault("format", SceneSpec.FORMAT)
         if spec.population is not None:
             tree["population"] = self.person_of(subject, subject_attempt).to_mapping()
         tree.setdefault("name", f"{spec.name} {sample}")

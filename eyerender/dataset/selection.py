@@ -160,6 +160,13 @@ class Selection:
         block, k = divmod(sample, self.planned)
         return block * self.subjects + k * self.subjects // self.planned
 
+    def place_of(self, sample: int) -> int:
+        """Return the place of a sample where the first samples of all subjects come first, then their second ones."""
+        subject = self.subject_of(sample)
+        block, k = divmod(subject, self.subjects)
+        rounds = -(-self.planned // self.subjects)
+        return (block * rounds + sample - self.first_of(subject)) * self.subjects + k
+
     def first_of(self, subject: int) -> int:
         """Return the first sample of a subject."""
         block, k = divmod(subject, self.subjects)

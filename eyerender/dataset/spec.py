@@ -76,7 +76,7 @@ class DatasetSpec(FileSpec):
     240
     """
 
-    FORMAT: ClassVar[int] = 2
+    FORMAT: ClassVar[int] = 3
 
     format: int = Field(default=FORMAT, description="version of this file format")
     kind: Literal["dataset"] = Field(description="declares that the file is a dataset, not a scene")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -17,6 +18,7 @@ from ..base.arrays import Floats
 from ..base.errors import InputError, Problems
 from .draws import (
     MARK,
+    RUN,
     ChoiceDraw,
     Draw,
     FixedDraw,
@@ -26,6 +28,7 @@ from .draws import (
     SobolDraw,
     Unit,
     is_draw,
+    mixed,
     parse_draw,
     random_value,
     unit_number,
@@ -56,13 +59,17 @@ class PlacedDraw:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Turn:
-    """Identity of the sample being drawn: index, subject, position in the subject's sequence, and both attempts."""
+    """Identity of the sample being drawn: index, subject, position in the subject's sequence, and both attempts.
+
+    `place` is its position where the first samples of all subjects come first (`Selection.place_of`).
+    """
 
     sample: int
     subject: int
     sequence: int
     attempt: int
     subject_attempt: int
+    place: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,15 +131,17 @@ class Template:
         if isinstance(draw, FixedDraw):
             return draw.value, 0
         if isinstance(draw, SequenceDraw):
-            k = turn.sequence % len(draw.values)
+            count = len(draw.values)
+            k = (turn.sequence + mixed(self.seed, "sequence", turn.subject, count)) % count
             return draw.values[k], k
         if isinstance(draw, GridDraw):
             k = self._grid_index(path, unit, number)
             return draw.point(k), k
         if isinstance(draw, SobolDraw) and attempt == 0:
-            dimensions = [p for p, d in self.draws.items() if isinstance(d.draw, SobolDraw) and d.unit == unit]
-            points = sobol_block(self.seed, unit, len(dimensions), number // _BLOCK)
-            return random_value(draw, float(points[number % _BLOCK, dimensions.index(path)])), 0
+            dimensions = tuple(p for p, d in self.draws.items() if isinstance(d.draw, SobolDraw) and d.unit == unit)
+            at = mixed(self.seed, f"sobol {unit} {dimensions}", turn.place if unit == "sample" else turn.subject, RUN)
+            points = sobol_block(self.seed, unit, dimensions, at // _BLOCK)
+            return random_value(draw, float(points[at % _BLOCK, dimensions.index(path)])), 0
         if isinstance(draw, MultivariateNormalDraw):
             places = (f"{path}[{k}]" for k in range(len(draw.mean)))
             return draw.at([unit_number(self.seed, place, unit, number, attempt) for place in places]), 0
@@ -187,12 +196,12 @@ def _label(draw: Draw, value: Any, k: int) -> Any:
 
 
 @lru_cache(maxsize=16)
-def sobol_block(seed: int, unit: str, dimensions: int, block: int) -> Floats:
-    """Return the points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, dimensions)."""
+def sobol_block(seed: int, unit: str, dimensions: tuple[str, ...], block: int) -> Floats:
+    """Return the points block * 256 .. + 255 of a scrambled Sobol sequence in (0, 1), (256, number of `dimensions`)."""
     from scipy.stats import qmc  # its import takes half a second
 
-    generator = np.random.default_rng([seed, 1 if unit == "subject" else 0])
-    engine = qmc.Sobol(dimensions, scramble=True, rng=generator)
+    generator = np.random.default_rng([seed, 1 if unit == "subject" else 0, zlib.crc32("/".join(dimensions).encode())])
+    engine = qmc.Sobol(len(dimensions), scramble=True, rng=generator)
     if block:
         # This is `fast_forward`, which takes a step for each point that it skips: point n is the shift and, for each
         # bit of n's Gray code, a direction number, all combined by exclusive or (Antonov and Saleev 1979).

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import zlib
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, loguniform, qmc, truncnorm, uniform
+from scipy.stats import kstest, loguniform, mannwhitneyu, qmc, spearmanr, truncnorm, uniform
 
 from eyerender.base.errors import InputError
-from eyerender.dataset.draws import parse_draw, random_value, truncated_normal, unit_number
+from eyerender.dataset.draws import RUN, parse_draw, random_value, truncated_normal, unit_number
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.dataset.template import Template, Turn, sobol_block
@@ -27,7 +29,8 @@ def template(tree, seed=0):
 
 def column(tree, n, path, seed=0, **turn):
     made = template(tree, seed)
-    return [made.values(Turn(sample=i, subject=i, sequence=0, attempt=0, subject_attempt=0))[1][path] for i in range(n)]
+    turns = (Turn(sample=i, subject=i, sequence=0, attempt=0, subject_attempt=0, place=i) for i in range(n))
+    return [made.values(turn)[1][path] for turn in turns]
 
 
 def test_unit_numbers_are_uniform_and_uncorrelated():
@@ -88,17 +91,55 @@ def test_grids_form_their_full_product():
 
 def test_sobol_draws_are_one_joint_sequence():
     tree = {"p": {"draw": "sobol", "low": 0, "high": 1}, "q": {"draw": "sobol", "low": 0, "high": 1}}
-    ours = np.array([column(tree, 700, name, seed=9) for name in "pq"]).T
-    engine = qmc.Sobol(2, scramble=True, rng=np.random.default_rng([9, 0]))
-    np.testing.assert_array_equal(ours, engine.random(1024)[:700])
+    ours = np.array([column(tree, 704, name, seed=9) for name in "pq"]).T
+    engine = qmc.Sobol(2, scramble=True, rng=np.random.default_rng([9, 0, zlib.crc32(b"p/q")]))
+    theirs = engine.random(1024)[:704]
+    assert not np.array_equal(ours, theirs)
+    for run in range(0, 704, RUN):  # in an order of its own
+        np.testing.assert_array_equal(np.sort(ours[run : run + RUN], axis=0), np.sort(theirs[run : run + RUN], axis=0))
     assert qmc.discrepancy(ours[:512]) < 0.2 * qmc.discrepancy(np.random.default_rng(0).random((512, 2)))
 
 
-def test_a_sequence_follows_the_frames_of_its_subject():
-    made = template({"x": {"draw": "sequence", "values": [[1, 2], [3, 4], [5, 6]]}})
-    assert [
-        made.values(Turn(sample=7, subject=1, sequence=k, attempt=0, subject_attempt=0))[0]["x"] for k in range(4)
-    ] == [[1, 2], [3, 4], [5, 6], [1, 2]]
+def test_a_sequence_follows_the_samples_of_its_subject_from_a_place_of_its_own():
+    made = template(
+        {"x": {"draw": "sequence", "values": [0, 1, 2]}, "y": {"draw": "sequence", "values": ["a", "b", "c"]}}
+    )
+    starts = []
+    for subject in range(300):
+        turns = [Turn(sample=7, subject=subject, sequence=k, attempt=0, subject_attempt=0) for k in range(4)]
+        trees = [made.values(turn)[0] for turn in turns]
+        first = trees[0]["x"]
+        assert [tree["x"] for tree in trees] == [(first + k) % 3 for k in range(4)]
+        assert [tree["y"] for tree in trees] == ["abc"[tree["x"]] for tree in trees]  # of one length: in step
+        starts.append(first)
+    assert all(sorted(starts[k : k + 3]) == [0, 1, 2] for k in range(0, 300, 3))
+    assert {tuple(starts[k : k + 3]) for k in range(0, 300, 3)} == set(itertools.permutations(range(3)))
+
+
+@pytest.mark.parametrize("name", ["people_openeds", "people_nvgaze", "people_pupil_core", "people_eyelink"])
+@pytest.mark.parametrize("count", [16, 24, 240])
+def test_gaze_does_not_depend_on_the_eye_and_few_samples_cover_it(name, count):
+    spec = Plan.load(name, count=count).spec
+    made = Plan.of(spec.model_copy(update={"population": None}))  # people cost time and draw nothing of it
+    drawn = [made.draw(sample) for sample in made.spec.selection.samples]
+    right = np.array([sample.scene["subject"]["eyes"][0] == "right" for sample in drawn])
+    assert right.mean() == pytest.approx(0.5) or name == "people_eyelink"  # which shows both eyes in each picture
+    places = ("targets.world_mm.0.1", "targets.world_mm.0.2", "targets.screen_mm.0.0", "targets.screen_mm.0.1")
+    gaze = np.array([[sample.draws[key] for key in places if key in sample.draws] for sample in drawn])
+    if gaze.size == 0:
+        pytest.skip("its gaze is not drawn by one sequence")
+    assert {tuple(row) for row in gaze > np.median(gaze, axis=0)} == {
+        (a, b) for a in (True, False) for b in (True, False)
+    }
+    if 0 < right.mean() < 1 and count == 240:
+        for column in gaze.T:
+            assert mannwhitneyu(column[right], column[~right]).pvalue > 1e-3
+
+
+def test_two_templates_have_independent_sequences():
+    node = {"draw": "sobol", "low": 0, "high": 1}
+    one, other = column({"p": node}, 256, "p"), column({"q": node}, 256, "q")
+    assert abs(spearmanr(one, other).statistic) < 0.2
 
 
 def test_choices_hold_whole_parts_with_draws_of_their_own():
@@ -170,13 +211,13 @@ def test_bad_specs_are_refused_with_their_path(path, node, words):
 
 @pytest.mark.parametrize("block", [0, 1, 2, 3, 255, 256, 3907])
 def test_a_block_of_the_sobol_sequence_is_found_without_walking_there(block):
-    engine = qmc.Sobol(3, scramble=True, rng=np.random.default_rng([11, 1]))
+    engine = qmc.Sobol(3, scramble=True, rng=np.random.default_rng([11, 1, zlib.crc32(b"a/b/c")]))
     if block:
         engine.fast_forward(256 * block)
-    np.testing.assert_array_equal(sobol_block(11, "subject", 3, block), engine.random(256))
+    np.testing.assert_array_equal(sobol_block(11, "subject", ("a", "b", "c"), block), engine.random(256))
 
 
 def test_the_last_sobol_points_of_a_thousand_million_samples_are_at_hand():
-    points = sobol_block(11, "sample", 3, (10**9 - 1) // 256)
+    points = sobol_block(11, "sample", ("a", "b", "c"), (10**9 - 1) // 256)
     assert points.shape == (256, 3)
     assert len(np.unique((points * 64).astype(int), axis=0)) > 200  # they still fill the cube

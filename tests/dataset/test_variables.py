@@ -138,7 +138,7 @@ def test_rows_of_a_table_are_drawn_whole_with_their_weights(tmp_path):
 
 def test_a_spec_extends_another(tmp_path):
     write(tmp_path / "base.yaml")
-    child: dict[str, Any] = {"format": 2, "kind": "dataset", "extends": "base.yaml", "name": "child"}
+    child: dict[str, Any] = {"format": 3, "kind": "dataset", "extends": "base.yaml", "name": "child"}
     child["scene"] = {"image": {"spp": 3}, "eye": {"pupil_diameter_mm": {"draw": "normal", "mean": 4, "sd": 0.1}}}
     (tmp_path / "child.yaml").write_text(yaml.safe_dump(child))
     expected = mapping(name="child", **{"scene.image.spp": 3, PUPIL: child["scene"]["eye"]["pupil_diameter_mm"]})

@@ -34,7 +34,7 @@ def scene_mapping(**more):
 
 def dataset_mapping(**more):
     scene = {"rig": RIG, "targets": {"world_mm": [[600, {"draw": "uniform", "low": -99, "high": 99}, 0]]}}
-    base = {"format": 2, "kind": "dataset", "name": "d", "count": 6, "subjects": 3, "seed": 3, "scene": scene}
+    base = {"format": 3, "kind": "dataset", "name": "d", "count": 6, "subjects": 3, "seed": 3, "scene": scene}
     return {**base, "population": {"preset": "adults"}, "require": "nothing", **more}
 
 

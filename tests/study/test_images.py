@@ -36,7 +36,7 @@ from tests.support.study_scenes import small_scenes
 
 @pytest.mark.parametrize("module", [guestrin, blignaut])
 def test_the_dataset_says_exactly_what_the_study_observes(module):
-    """Every sample of the plan, in order, is one of the study's own noisy shots: scene, eye file, seed and all; the
+    """Every sample of the plan is one of the study's own noisy shots: scene, eye file, seed and all; the
     others are the same without noise, and exposed beside them."""
     scenes = scenes_of(module, ("E1", "E5"), ("published", "corrected"))
 
@@ -54,17 +54,21 @@ def test_the_dataset_says_exactly_what_the_study_observes(module):
     assert spec.labels.noiseless
     assert [s.spec for s in quiet] == [without_noise(s).spec for s in wanted]
     assert spec.count == len(wanted) == 2 * 2 * (15 if module is guestrin else 4) / 2
-    for k, scene in enumerate(wanted):
-        sample = plan.draw(k)
-        assert sample.scene == scene.spec.to_mapping()
-        assert sample.eye["name"] == scene.eye_spec.name
-        assert sample.turn.subject == k // (len(wanted) // 2)
+    half = len(wanted) // 2
+    for subject in range(2):  # an eye model, which enters the sequence of its scenes anywhere
+        drawn = [plan.draw(subject * half + k) for k in range(half)]
+        at = next(k for k, scene in enumerate(wanted) if drawn[0].scene == scene.spec.to_mapping()) - subject * half
+        for k, sample in enumerate(drawn):
+            scene = wanted[subject * half + (k + at) % half]
+            assert sample.scene == scene.spec.to_mapping()
+            assert sample.eye["name"] == scene.eye_spec.name
+            assert sample.turn.subject == subject
     assert {w.spec.image.spp for w in wanted} == {4}
     # One of them alone is a dataset without the other.
     for alone in (wanted, quiet):
         spec = dataset_spec("study", alone)
         assert (spec.count, spec.labels.noiseless) == (len(alone), False)
-        assert Plan.of(spec).draw(0).scene == alone[0].spec.to_mapping()
+        assert Plan.of(spec).draw(0).scene in [scene.spec.to_mapping() for scene in alone[: len(alone) // 2]]
     assert {len(w.frames()) for w in wanted} == {9 if module is guestrin else 135}
 
 

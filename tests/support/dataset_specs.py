@@ -19,7 +19,7 @@ from eyerender.dataset.run import generate
 from eyerender.dataset.spec import DatasetSpec
 
 TINY: dict[str, Any] = {
-    "format": 2,
+    "format": 3,
     "kind": "dataset",
     "name": "tiny",
     "count": 24,

@@ -180,7 +180,7 @@ def dataset_spec(study: str, scenes: Sequence[Scene], auto_exposure: float | Non
     template["eye"]["model"] = {"draw": "grid", "per": "subject", "values": list(by_model)}
     return DatasetSpec.from_mapping(
         {
-            "format": 2,
+            "format": DatasetSpec.FORMAT,
             "kind": "dataset",
             "name": f"{study}, images",
             "description": "What the image observer of a study sees. A subject is an eye model; a sample is one eye at "
