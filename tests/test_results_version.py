@@ -40,7 +40,7 @@ def test_rendered_results_are_those_of_the_version(stored):
 @pytest.mark.render
 @pytest.mark.slow
 def test_a_skin_that_is_lighter_by_half_a_percent_is_seen(stored):
-    plan = Plan.load("dataset_region", count=1)
+    plan = golden.plan_of("dataset_region")
     scene = deepcopy(dict(plan.spec.scene))
     albedo = scene["region"]["skin"]["albedo"]
     albedo |= {bound: 1.005 * albedo[bound] for bound in ("low", "high")}
@@ -50,7 +50,7 @@ def test_a_skin_that_is_lighter_by_half_a_percent_is_seen(stored):
 
 @pytest.mark.render
 def test_an_iris_that_is_wider_by_half_a_percent_is_seen(stored):
-    plan = Plan.load("dataset_quick", count=1)
+    plan = golden.plan_of("dataset_quick")
     eye = deepcopy(dict(plan.eyes["E2"]))
     eye["iris"]["root_radius_mm"] *= 1.005
     wider = golden.first_image(replace(plan, eyes={"E2": eye}))
