@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from io import BytesIO
 from pathlib import Path
@@ -41,16 +42,16 @@ def read_objects(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     if kind not in MOST_BYTES:
         raise InputError(f"must end with {', '.join(MOST_BYTES)}", source=source)
     data = read_bytes(path, limit=MOST_BYTES[kind])
-    _refuse_many(data, kind, source)
     options: dict[str, Any] = {}
     if kind == ".ply":
         data = plain_ply(data, source=source)
     elif kind == ".glb":
         data = _plain_glb(data, source)
     elif kind == ".obj":
-        data = b"\n" + data.decode("utf-8", errors="replace").encode()
-        options = {"skip_materials": True, "group_material": False}  # materials are other files
+        data = _plain_obj(data)
+        options = {"skip_materials": True, "group_material": False}
         options |= {"split_objects": True} if b"\no " in data else {"split_groups": True} if b"\ng " in data else {}
+    _refuse_many(data, kind, source)
     try:
         scene = trimesh.load_scene(BytesIO(data), file_type=kind[1:], process=False, **options)
         count = sum(len(getattr(scene.geometry[scene.graph[n][1]], "faces", ())) for n in scene.graph.nodes_geometry)
@@ -91,6 +92,14 @@ def _refuse_many(data: bytes, kind: str, source: str) -> None:
     faces = data.count(b"\nf") if kind == ".obj" else 0
     if faces > MOST_TRIANGLES:
         raise InputError(f"holds {faces} faces; at most {MOST_TRIANGLES} are read", source=source)
+
+
+def _plain_obj(data: bytes) -> bytes:
+    """Return the lines of an OBJ with vertices, faces, objects and groups; materials are other files."""
+    text = b"\n" + data.decode("utf-8", errors="replace").encode()
+    text = text.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
+    # Trimesh starts a new mesh at each material, wherever the word stands.
+    return re.sub(rb"\n(?!v|f |o |g )[^\n]*", b"", text).replace(b"usemtl ", b" ")
 
 
 def _plain_glb(data: bytes, source: str) -> bytes:

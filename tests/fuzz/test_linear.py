@@ -11,7 +11,7 @@ import pytest
 from eyerender.base.errors import EyerenderError
 from eyerender.base.storage.files import read_json
 from eyerender.gaze.records import load_observations
-from eyerender.region.head import _objects
+from eyerender.region.meshfile import read_objects
 from eyerender.rig.opencv import read_opencv
 from tests.support.growth import growth
 
@@ -24,13 +24,14 @@ TEXTS = {
     "records.csv": ["a,", "a\n", '"', '"a""b', ";", "pupil_x_px_", "-mm", "pupil_x,pupil_y\n1,"],
     "records.jsonl": ["{}\n", "["],
     "head.obj": ["v 0 0 0\n", "f 1 1 1\n", "f 1//", "o a\n", "g a\n", "\\\n", "v 1 ", "usemtl a\n"],
+    "head.stl": ["solid a\n", "facet normal 0 0 1\n", "vertex 0 0 0\n", "endfacet\n", "\n", "a "],
     "head.ply": ["ply\n", "ply\ncomment ", "ply\nelement vertex 1\n", "ply\nproperty float x\n"],
 }
 READERS: dict[str, Callable[[Path], object]] = {
     "camera": read_opencv,
     "data": read_json,
     "records": lambda path: load_observations(path, None),
-    "head": _objects,
+    "head": read_objects,
 }
 
 

@@ -233,6 +233,22 @@ def test_every_format_gives_the_same_head(tmp_path, name):
     assert np.linalg.norm(head.normals, axis=1) == pytest.approx(1.0)
 
 
+def test_a_change_of_material_loses_no_triangle(tmp_path):
+    lines = [
+        "v 0 0 0",
+        "v 40 0 0",
+        "v 0 40 0",
+        "v 0 0 60",
+        "usemtl lip",
+        "f 1 2 3",
+        "usemtl cheek",
+        "f 1 2 4",
+        "f 2 3 4",
+    ]
+    (tmp_path / "materials.obj").write_text("\n".join(lines) + "\n")
+    assert len(load_head(spec_of(tmp_path, file="materials.obj", right_eye=[0, 0, 0])).faces) == 3
+
+
 def test_nodes_of_a_glb_are_parts_in_their_places(tmp_path):
     scene = two_parts()
     scene.apply_scale(1e-3)
@@ -287,10 +303,12 @@ GLB = {
 
 def hostile(kind):
     """A file that would take a trusting reader minutes, or gigabytes."""
-    corner = "v 0 0 0\nv 40 0 0\nv 0 40 0\nv 0 0 30\n"
+    corner = "v 0 0 0\nv 4 0 0\nv 0 4 0\nv 0 0 3\n"
     facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 40 0 0\nvertex 0 40 0\nendloop\nendfacet\n"
     if kind == "faces.obj":
         return (corner + "f 1 2 3\nf 1 2 3 4\n" * 1_000_000).encode()
+    if kind == "materials.obj":
+        return (corner + "usemtl a\nf 1 2 3\n" * 200_000).encode()
     if kind == "objects.obj":
         return (corner + "".join(f"o a{k}\nf 1 2 3\n" for k in range(100_000))).encode()
     if kind == "solids.stl":
@@ -311,6 +329,7 @@ def hostile(kind):
 
 HOSTILE = {
     "faces.obj": "holds 2000000 faces; at most 1000000 are read",
+    "materials.obj": "unit: with unit mm",  # read at once; only its size is wrong
     "objects.obj": "holds 100000 objects; at most 1000 are read",
     "solids.stl": "objects; at most 1000 are read",
     "large.stl": "is too large",

@@ -16,6 +16,8 @@ from eyerender.apps import survey as surveys
 from eyerender.apps.benchmark import page as bench
 from eyerender.apps.inspection import page as inspection
 from eyerender.apps.realism import page as realism
+from eyerender.apps.realism.figures import FIGURES
+from eyerender.apps.realism.folder import FolderFigures
 from eyerender.apps.study import figures as study
 from eyerender.apps.study import observer_figures, rigs_page
 from eyerender.apps.study.featureclouds import Cloud
@@ -298,17 +300,18 @@ def case_histograms(kept):
 
 def case_correlations(kept):
     matrix = np.array([[1, 0.5, -0.2], [0.5, 1, 0.1], [-0.2, 0.1, 1]])
-    inspection._correlation_figure(SimpleNamespace(correlated=(["a", "b", "c"], matrix)))
+    found: Any = SimpleNamespace(correlated=(["a", "b", "c"], matrix))
+    inspection._correlation_figure(found)
     ax = kept[0].axes[0]
     np.testing.assert_allclose(ax.images[0].get_array(), matrix)
     assert [t.get_text() for t in ax.get_xticklabels()] == ["a", "b", "c"]
 
 
 def case_realism(kept):
-    name, *others = realism.FIGURES
+    name, *others = FIGURES
     values = ([1.0, 2.0, 3.0, 4.0, 5.0], [2.0, 4.0, 6.0, 8.0, 10.0])
     folders = [
-        realism.FolderFigures(
+        FolderFigures(
             path=str(k), images=5, gamma=1.0, gamma_from="given", landmarks="labels", skipped=(), tiles=(), patches=(),
             rows=tuple((str(i), {name: v, **dict.fromkeys(others)}) for i, v in enumerate(own)),
         )
@@ -411,11 +414,11 @@ def test_a_figure_shows_the_numbers_of_its_results(case, kept):
 
 
 def test_a_heat_map_has_its_first_row_on_top(monkeypatch):
-    figures = []
-    monkeypatch.setattr(style, "svg", lambda fig: figures.append(fig) or "")
+    figures: list[Any] = []
+    monkeypatch.setattr(style, "svg", figures.append)
     style.heat_map(np.array([[1.0, 2.0], [3.0, NAN]]), (-20, 20, -15, 15), ("x", "y"))
     (image,) = figures[0].axes[0].images
-    np.testing.assert_allclose(np.ma.filled(image.get_array(), NAN), [[1, 2], [3, NAN]])
+    np.testing.assert_allclose(np.ma.filled(image.get_array(), NAN), np.array([[1, 2], [3, NAN]]))
     assert (image.origin, tuple(image.get_extent())) == ("upper", (-20, 20, -15, 15))
 
 
