@@ -12,8 +12,10 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 import eyerender as er
 from docs.tools import keys, references, validation
@@ -168,6 +170,21 @@ def test_the_first_hour_leaves_no_file_in_the_checkout():
         assert subprocess.run(["git", "check-ignore", "-q", place], cwd=ROOT, check=False).returncode == 0, place
 
 
-def test_one_script_makes_every_picture():
-    given = runpy.run_path(str(ROOT / "scripts" / "tools" / "make_docs_pictures.py"))
-    assert set(given["PICTURES"]) == {path.name for path in (DOCS / "images").iterdir()}
+@pytest.fixture(scope="module")
+def makers():
+    return runpy.run_path(str(ROOT / "scripts" / "tools" / "make_docs_pictures.py"))["PICTURES"]
+
+
+def test_one_script_makes_every_picture(makers):
+    assert set(makers) == {path.name for path in (DOCS / "images").iterdir()}
+
+
+@pytest.mark.parametrize("name", ["view_eye.png", "view_scene.png", "frames.png", "eye_angles.png", "pixels.png"])
+def test_a_drawing_of_the_pages_is_the_one_of_today(makers, name, tmp_path):
+    """Rendered pictures take minutes, and are left to the script."""
+    makers[name](tmp_path / name, tmp_path)
+    mine, told = (
+        np.asarray(Image.open(path).convert("L"), dtype=float) for path in (tmp_path / name, DOCS / "images" / name)
+    )
+    assert mine.shape == told.shape
+    assert np.mean(np.abs(mine - told) > 64) < 1e-3  # fonts may differ by a little
