@@ -253,7 +253,7 @@ BOUNDS = {
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,
-    "region": 4095,  # heads from STL and GLB files of any tool, with all mistakes named at once
+    "region": 4100,  # heads from STL and GLB files of any tool, with all mistakes named at once
     "rendering": 12520,
     "report": 970,
     "rig": 3130,  # cameras and LEDs that serve one eye: headsets; exposure set by the lights
