@@ -155,9 +155,12 @@ def test_the_page_on_stability_names_the_formats_of_the_code():
         on_page[name] = max(on_page.get(name, 0), int(version))
     assert {"record", "image", "gaze", "gaze-calibration"} <= on_page.keys()
     assert on_page == {name: newest[name] for name in on_page}
-    rows = {kind: line for line in page.splitlines() for kind in ("scene", "eye") if line.startswith(f"| {kind}")}
-    assert rows["scene"] == f"| scene, dataset spec (YAML) | {er.SceneSpec.FORMAT} |"
-    assert rows["eye"] == f"| eye (YAML) | {er.EyeSpec.FORMAT} |"
+    rows = {
+        kind: line for line in page.splitlines() for kind in ("scene", "dataset spec") if line.startswith(f"| {kind}")
+    }
+    assert rows["scene"] == f"| scene (YAML) | {er.SceneSpec.FORMAT} |"
+    assert rows["dataset spec"] == f"| dataset spec, eye (YAML) | {er.EyeSpec.FORMAT} |"
+    assert er.EyeSpec.FORMAT == er.DatasetSpec.FORMAT
 
 
 def test_the_first_hour_leaves_no_file_in_the_checkout():
