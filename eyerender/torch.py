@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from .backends.choose import BackendChoice
-from .base.errors import InputError
+from .base.errors import WRONG, InputError
 from .base.processes import spawning, usable_cpus
 from .dataset.plan import Plan
 from .dataset.realise import frames_of
@@ -368,7 +368,7 @@ def _item(
         for part in parts:
             item[part] = _value(part, line, picture)
         return item | {key: line[key] for key in ("sample", "subject") if line.get(key) is not None}
-    except (KeyError, TypeError, IndexError, ValueError) as error:
+    except WRONG as error:
         raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
 
 

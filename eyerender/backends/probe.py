@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import EyerenderError, InputError
+from ..base.errors import WRONG, EyerenderError, InputError
 from ..base.processes import python_command, run
 from ..base.storage.cachefolder import cache_folder
 from ..base.storage.files import read_json, write_json
@@ -153,7 +153,7 @@ def _read_verdict(file: Path) -> Verdict | None:
         stored = read_json(file, limit=_VERDICT_BYTES, follow=False)["verdict"]
         verdict = Verdict(bool(stored["ok"]), str(stored["detail"]))
         return verdict if verdict.ok or time.time() - file.stat().st_mtime < REFUSAL_AGE_S else None
-    except (InputError, OSError, ValueError, KeyError, TypeError):
+    except (InputError, OSError, *WRONG):
         return None
 
 

@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 
 # A message may quote a file that somebody else made. Longer parts are shortened in the middle.
 MAX_MESSAGE, MAX_SOURCE, MAX_PATH, MAX_REASON = 2000, 600, 200, 400
+# What Python raises for values of another type or range than a reader expects.
+WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
 # Errors of one input that are reported together. More do not help, and a file may have millions.
 MAX_ERRORS = 20
 

@@ -30,7 +30,7 @@ from pydantic import (
 )
 
 from .errors import InputError, Problems
-from .storage.files import opened, read_text, shown
+from .storage.files import MAX_FILE_BYTES, opened, read_text, shown
 
 # Limits of a YAML file. Nodes are counted after expansion: an alias counts as much as the value that it repeats. A
 # scene with a list of 20,000 targets has 80,000 nodes; reading 100,000 takes some five seconds.
@@ -311,13 +311,13 @@ def parse_yaml(text: str, source: str, *, mapping_tags: tuple[str, ...] = ()) ->
     return data
 
 
-def file_digest(path: Path) -> str:
-    """Compute the SHA-256 of a regular file's bytes.
+def file_digest(path: Path, *, limit: int = MAX_FILE_BYTES) -> str:
+    """Compute the SHA-256 of a regular file's bytes, at most `limit`.
 
     Raises:
         InputError: it cannot be read.
     """
-    with opened(path) as file:
+    with opened(path, limit=limit) as file:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:

@@ -44,7 +44,6 @@ def fit_eye(
         outline_px: Standard deviation of one pixel of outline, for records without covariance.
         glint_px: Standard deviation of a glint along each axis, for records without covariance.
     """
-    from ..base.spec import read_yaml
     from ..design.fit import fit_eye as fit
     from ..design.fitfolder import write_fits
     from ..design.noise import FeatureNoise
@@ -53,7 +52,7 @@ def fit_eye(
     from ..gaze.records import load_observations
 
     observations, built = load_observations(recording, rig=rig, columns=columns)
-    given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
+    given = None if unknowns is None else Unknowns.load(unknowns)
     noise = FeatureNoise.of(outline_px, glint_px, rig=built)
     fits = fit(observations, built, given, prior=load_eye(eye), noise=noise, targets=targets, robust=robust)
     found = write_fits(output, fits, overwrite=overwrite)

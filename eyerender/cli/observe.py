@@ -102,7 +102,7 @@ def extract(
         processes: Number of images processed at the same time (default: one per processor).
     """
     from ..base.storage.files import make_folder, refuse_special, write_text
-    from ..extraction.video import VideoReader, is_video
+    from ..folders.video import VideoReader, is_video
     from ..gaze.records import is_table
     from ..gaze.table import features_csv
     from ..imaging.imageobserver import ImageObserver, files_of, lights_of

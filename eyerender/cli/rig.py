@@ -39,11 +39,10 @@ def rig(
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
     """
     from ..apps.rigs.report import REPORT, run_rig
-    from ..base.spec import read_yaml
     from ..design.unknowns import Unknowns
     from ..scene import load_scene
 
-    given = None if unknowns is None else Unknowns.from_mapping(read_yaml(unknowns), source=str(unknowns))
+    given = None if unknowns is None else Unknowns.load(unknowns)
     everyone = read_population(population, "--population")
     with progress("rig") as steps:
         found = run_rig(

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import EyerenderError, InputError
+from ..base.errors import WRONG, EyerenderError, InputError
 from ..base.progress import Progress, notify
-from ..base.storage.files import MAX_FILE_BYTES, read_json, remove_parts, write_json, write_text, written
+from ..base.storage.files import MAX_FILE_BYTES, opened, read_json, remove_parts, write_json, write_text, written
+from ..base.storage.jsonlines import MAX_BYTES
 from ..folders.imagefolder import (
     CONVENTIONS,
     DATASET,
@@ -99,7 +100,7 @@ class LineTable:
         try:
             with written(self._folder / METADATA) as file:
                 file.writelines(line.encode() for line in type_first(self._lines, self._statistics.take_line))
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except WRONG as error:
             raise InputError(
                 f"the lines of a shard do not have the format of this version ({type(error).__name__}: {error})",
                 source=str(self._folder),
@@ -109,8 +110,8 @@ class LineTable:
 
     def _lines(self) -> Iterator[str]:
         for shard in self._plan.spec.shards:
-            with open(self._folder / SHARDS / shard_name(shard) / LINES, encoding="utf-8") as file:
-                yield from file
+            with opened(self._folder / SHARDS / shard_name(shard) / LINES, limit=MAX_BYTES, follow=False) as file:
+                yield from map(bytes.decode, file)
 
 
 class PackedTable:
@@ -132,7 +133,7 @@ class PackedTable:
         self._parts.append(packed_index(done, shard, self._splits, source))
         try:
             self._statistics.take_counts(done["counts"])
-        except (KeyError, TypeError, ValueError) as error:
+        except WRONG as error:
             reason = f"is not in the format of this version ({error})"
             raise InputError(reason, source=source, path="counts") from None
 

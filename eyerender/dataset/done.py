@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from ..base.errors import InputError
-from ..base.storage.files import inside, read_json
+from ..base.storage.files import inside, opened, read_json
+from ..base.storage.jsonlines import MAX_BYTES
 from ..base.versions import package_version
 from ..folders.imagefolder import (
     ARRAY_KEYS,
@@ -144,8 +145,8 @@ def compare_sums(folder: Path, sums: Mapping[str, Mapping[str, Any]], *, quick: 
 
 
 def checksum(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with open(path, "rb") as file:
+    """Return the SHA-256 of a regular file; raises `InputError` for any other."""
+    with opened(path, limit=MAX_BYTES, follow=False) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import InputError
 from ..base.spec import read_yaml
-from ..base.storage.files import read_text, shown
+from ..base.storage.files import read_table, shown
 from .draws import MARK, is_draw
 
 MAX_ROWS = 10_000
@@ -80,12 +80,13 @@ def _choice(node: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         key = str(next(iter(unknown), "file"))
         raise InputError("a table draw has the keys file, weights (a column) and per", path=key)
     path = folder / node["file"]
-    reader = csv.DictReader(read_text(path, limit=_MAX_BYTES).splitlines())
-    rows = []
-    for number, row in enumerate(reader, 2):
+    rows: list[dict[str, float]] = []
+    for number, row in enumerate(islice(read_table(path, limit=_MAX_BYTES), MAX_ROWS + 1), 2):
         try:
-            rows.append({str(key).strip(): float(value) for key, value in row.items()})
-        except (TypeError, ValueError):
+            rows.append({key.strip(): float(value) for key, value in row.items()})
+            if rows[-1].keys() != rows[0].keys():
+                raise ValueError("a cell is missing")
+        except ValueError:
             raise InputError("every cell must be a number", source=str(path), path=f"line {number}") from None
     if not 0 < len(rows) <= MAX_ROWS:
         raise InputError(f"must have 1 to {MAX_ROWS} rows below its header", source=str(path))

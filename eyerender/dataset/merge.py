@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import EyerenderError, InputError
+from ..base.errors import WRONG, EyerenderError, InputError
 from ..base.progress import Progress
 from ..base.storage.files import inside, make_folder, opened, sync_folder, sync_tree, write_json
 from ..base.storage.lock import final_lock, run_lock
@@ -54,7 +54,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | 
             raise InputError(f"holds another run than {parts[0]}, or another number of samples", source=str(place))
     try:
         plan = Plan.from_mapping(runs[0], places[0])
-    except (KeyError, TypeError) as error:
+    except WRONG as error:
         raise InputError(f"holds no plan ({error})", source=str(places[0] / RUN)) from None
     check_work(plan.spec, places[0])
     refuse_taken(folder)

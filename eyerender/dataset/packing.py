@@ -29,7 +29,7 @@ from ..base.storage.files import (
     written,
 )
 from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, shard_name
-from ..folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines, read_line
+from ..folders.packed import LINES_GZ, MEMBERS, TAR, pack_lines, read_line, read_member
 from .done import FILES, PACKED, sum_of
 from .selection import scrambled
 
@@ -93,17 +93,15 @@ def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
     for own in (TAR, LINES_GZ):
         if sum_of(stage / SHARD / own) != done["files"][f"{SHARDS}/{name}/{own}"]:
             raise ValueError(f"{own}: its checksum differs")
-    files = {}
-    with open(stage / SHARD / TAR, "rb") as tar:
-        lines = list(_lines(stage, done))
-        for line in lines:
-            for key, (first, size) in line.pop(MEMBERS).items():
-                kind = next(kind for kind, own in KINDS.items() if own == key)
-                tar.seek(first)
-                data, own = tar.read(size), PurePosixPath(line[key]).name
-                make_folder(stage / kind)
-                write_bytes(stage / kind / own, data, sync=False)
-                files[f"{kind}/{name}/{own}"] = {"bytes": size, "sha256": hashlib.sha256(data).hexdigest()}
+    files, kinds = {}, {key: kind for kind, key in KINDS.items()}
+    lines = list(_lines(stage, done))
+    for line in lines:
+        for key, place in line.pop(MEMBERS).items():
+            data = read_member(stage, SHARD, place, source=str(stage), path=key)
+            kind, own = kinds[key], PurePosixPath(line[key]).name
+            make_folder(stage / kind)
+            write_bytes(stage / kind / own, data, sync=False)
+            files[f"{kind}/{name}/{own}"] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=lambda line: int(line["sample"]))).encode()
     write_bytes(stage / SHARD / LINES, text)
     files[f"{SHARDS}/{name}/{LINES}"] = {"bytes": len(text), "sha256": hashlib.sha256(text).hexdigest()}

@@ -24,7 +24,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from ..base.errors import InputError
+from ..base.errors import WRONG, InputError
 from ..base.storage.files import (
     PART,
     inside,
@@ -37,6 +37,7 @@ from ..base.storage.files import (
     sync_folder,
     write_json,
 )
+from ..base.storage.jsonlines import MAX_BYTES
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, STAGE, shard_name
 from .done import FILES, PACKED, cpu_family, described, picture_file, read_done, read_done_file, run_versions, sum_of
@@ -199,7 +200,7 @@ class PartialShard:
         self._lines.close()
         places = sorted(self._places)
         self._places, self._hash, self._size, self.images = [], hashlib.sha256(), 0, 0
-        with open(self.stage / SHARD / LINES, "rb") as file:
+        with opened(self.stage / SHARD / LINES, limit=MAX_BYTES, follow=False) as file:
             self._lines = self._new_lines()
             for sample, first, length in places:
                 file.seek(first)
@@ -216,7 +217,7 @@ class PartialShard:
             kept = [(line, raw) for line, raw in lines if line["sample"] in wanted]
             names = {str(line[key]) for line, _ in kept for key in KINDS.values() if line[key] is not None}
             self._files = {name: done["files"][name] for name in names}
-        except (InputError, KeyError, TypeError, ValueError, OSError):
+        except (InputError, OSError, *WRONG):
             kept, done = [], {"rejections": [], "given_up": [], "saturated": [], "seconds": 0.0}
             remove_file(self.stage / DONE)
             wanted = set()
@@ -244,7 +245,7 @@ class PartialShard:
             if name != own and sum_of(inside(self.stage, f"{kind}/{file}")) != entry:
                 raise InputError(f"{name}: its checksum differs")
         with opened(self.stage / SHARD / LINES, follow=False) as file:
-            data = file.read(done["files"][own]["bytes"])
+            data = file.read(min(done["files"][own]["bytes"], os.fstat(file.fileno()).st_size))
         if hashlib.sha256(data).hexdigest() != done["files"][own]["sha256"]:
             raise InputError("its lines differ")
         for raw in data.splitlines(keepends=True):
@@ -377,7 +378,7 @@ def _unpacked(stage: Path, done: dict[str, Any]) -> dict[str, Any] | None:
     """Unpack a packed shard to continue it; remove it if it is damaged, but keep it if only the disk is full."""
     try:
         return unpack(stage, done)
-    except (InputError, KeyError, TypeError, ValueError, FileNotFoundError):
+    except (InputError, FileNotFoundError, *WRONG):
         shutil.rmtree(stage, ignore_errors=True)
         return None
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import InputError
-from ..base.storage.files import opened, parse_json, printable
+from ..base.errors import WRONG, InputError
+from ..base.storage.files import appended, opened, parse_json, printable
 from ..folders.imagefolder import DATASET, LOG, RUN, finished, read_run
 from .done import read_done
 from .partial import checkpoints
@@ -60,7 +60,7 @@ class Log:
             **data,
         }
         self.written = time.monotonic()
-        with open(self._path, "ab+") as file:
+        with appended(self._path) as file:
             if file.tell():
                 file.seek(-1, os.SEEK_END)
                 if file.read(1) != b"\n":  # a power cut may have truncated the last line
@@ -124,7 +124,7 @@ def status(path: str | Path) -> dict[str, Any]:
     run = read_run(folder)
     try:
         spec = DatasetSpec.from_mapping(run["spec"])
-    except (KeyError, TypeError, InputError) as error:
+    except (InputError, *WRONG) as error:
         raise InputError(f"has no spec that can be read ({error})", source=str(folder / RUN), path="spec") from None
     check_work(spec, folder)
     selection = spec.selection
@@ -168,7 +168,7 @@ def status(path: str | Path) -> dict[str, Any]:
 def _parts(folder: Path) -> list[_Part]:
     found: dict[tuple[str, str], _Part] = {}
     for event in _events(folder / LOG):
-        with suppress(KeyError, TypeError, ValueError):
+        with suppress(*WRONG):
             key = printable(str(event["host"])[:80]), printable(str(event.get("part", "1/1"))[:40])
             found.setdefault(key, _Part(host=key[0], part=key[1])).take(event)
     now = time.time()

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from ..backends.choose import BackendChoice
-from ..base.errors import InputError
+from ..base.errors import WRONG, InputError
 from ..base.progress import Progress
 from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
 from .assemble import verify_dataset
 from .validation.images import Tally, check_images
 from .validation.lines import Lines, check_records
-from .validation.problems import WRONG, FolderProblems
+from .validation.problems import FolderProblems
 from .validation.rendering import render_again
 from .validation.shards import compare_lines
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of

@@ -14,13 +14,14 @@ the eye at the start of the analysis.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats
-from ..base.spec import Spec
+from ..base.spec import Spec, read_yaml
 
 FRAME = ("azimuth", "elevation", "pupil", "slippage_x", "slippage_y", "slippage_z")
 PERSON = (
@@ -110,6 +111,11 @@ class Unknowns(Spec):
             "pupil_shift": 0.07,
         }
         return cls.population(**{**shapes, **fields})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a YAML file with some of the keys; raises `InputError` like `from_mapping`."""
+        return cls.from_mapping(read_yaml(path), source=str(path))
 
     def deviations(self) -> Floats:
         """Return standard deviations (23,) in rad and mm: 0 if known, inf if unknown."""

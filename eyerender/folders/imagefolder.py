@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import Bytes, Ints, Singles
-from ..base.errors import InputError, Refuse, UnfinishedRunWarning
+from ..base.errors import WRONG, InputError, Refuse, UnfinishedRunWarning
 from ..base.storage.files import inside, is_plain, read_bytes, read_json, shown, write_bytes, write_json
 from ..base.storage.jsonlines import JsonLines, LineFiles
 from ..base.versions import package_version
@@ -479,13 +479,13 @@ def packed_index(done: Mapping[str, Any], shard: int, splits: Sequence[str], sou
     """
     try:
         columns, names = done["columns"], done["splits"]
-        out = np.zeros(int(done["images"]), dtype=INDEX_TYPE)
+        out = np.zeros(len(columns["sample"]), dtype=INDEX_TYPE)
         for key in ("sample", "subject", "block"):
             out[key] = columns[key]
         out["split"] = np.array([splits.index(name) for name in names], dtype=np.uint16)[np.array(columns["split"])]
         out["shard"], out["row"] = shard, np.arange(len(out))
         return out
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+    except WRONG as error:
         raise InputError(
             f"is not in the format of this version ({type(error).__name__}: {error})", source=source, path="columns"
         ) from None
@@ -495,7 +495,8 @@ def packed_lines(folder: Path, shards: Sequence[int]) -> PackedLines:
     """Return the metadata of some packed shards, located by their done.json."""
     files = {shard: _shard_file(folder, shard, DONE) for shard in shards}
     dones = {shard: read_json(file, limit=MAX_DONE_BYTES, follow=False) for shard, file in files.items()}
-    splits = tuple(sorted({str(name) for done in dones.values() for name in done.get("splits") or ()}))
+    named = [done.get("splits") for done in dones.values()]
+    splits = tuple(sorted({str(name) for names in named if isinstance(names, list) for name in names}))
     parts = [packed_index(done, shard, splits, str(files[shard])) for shard, done in dones.items()]
     rows = np.concatenate([np.zeros(0, dtype=INDEX_TYPE), *parts])
     return PackedLines(folder=folder, splits=splits, given=rows)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import Ints
-from ..base.errors import InputError
+from ..base.errors import WRONG, InputError
 from ..base.storage.arrays import mapped_array
 from ..base.storage.files import inside, opened, parse_json
 from ..base.storage.jsonlines import MAX_LINE_BYTES
@@ -233,7 +233,7 @@ def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
         return _closed(head.shared | head.tables[group] | dict(zip(head.shapes[shape], values, strict=True)))
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
+    except WRONG as error:
         raise InputError(f"is not a packed line ({type(error).__name__}: {error})", source=name, path=where) from None
 
 

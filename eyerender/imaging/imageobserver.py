@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..backends.choose import BackendChoice
 from ..base.arrays import Floats, Ints
-from ..base.errors import InputError, InputWarning, Warn
+from ..base.errors import WRONG, InputError, InputWarning, Warn
 from ..base.processes import mapper
 from ..base.progress import Progress, followed, followed_by
 from ..base.storage.files import parse_json
@@ -360,7 +360,7 @@ def rigs_of(folder: ImageFolder) -> list[RigGeometry]:
                 raise TypeError
             rig = parse_json(text)["rig"]
             key = json.dumps([{**rig, "lights": None}, [{**light, "intensity_mw_sr": 0} for light in rig["lights"]]])
-        except (InputError, KeyError, TypeError, ValueError):
+        except (InputError, *WRONG):
             raise InputError("has no parameters", source=source) from None
         if key not in found:
             found[key] = Rig.from_mapping(rig, source=source).resolved().build()

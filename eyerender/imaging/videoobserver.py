@@ -13,7 +13,8 @@ from ..base.errors import Warn
 from ..base.progress import Progress, notify
 from ..base.storage.files import written
 from ..extraction.overlay import overlay as drawn
-from ..extraction.video import VideoReader, VideoWriter, follow
+from ..extraction.video import VideoWriter, follow
+from ..folders.video import VideoReader
 from ..gaze.records import is_table
 from ..gaze.table import features_csv
 from ..scene import Scene

@@ -23,7 +23,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..base.errors import EyerenderError, InputError
+from ..base.errors import WRONG, EyerenderError, InputError
 from ..base.storage.cachefolder import cache_folder
 from ..base.storage.files import PART, parse_json, read_bytes, written
 from ..base.versions import __version__
@@ -141,7 +141,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
         body = memoryview(data)[len(line) + 1 :]
         if sound and len(body) == np.prod(shape) * np.dtype(dtype).itemsize and header["crc32"] == zlib.crc32(body):
             return np.frombuffer(body, dtype).reshape(shape)
-    except (InputError, ValueError, KeyError, TypeError, OverflowError):
+    except (InputError, *WRONG):
         pass
     return None
 

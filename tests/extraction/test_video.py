@@ -16,7 +16,8 @@ import make_ideal_images as ideal
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.extraction import REFINED, extract, extract_eyes
-from eyerender.extraction.video import SUFFIXES, VideoFrame, VideoReader, VideoWriter, follow
+from eyerender.extraction.video import VideoWriter, follow
+from eyerender.folders.video import SUFFIXES, VideoFrame, VideoReader
 from eyerender.optics.ellipse import Ellipse, iou
 
 SEEDS = range(20_300, 20_306)

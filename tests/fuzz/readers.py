@@ -1,50 +1,36 @@
-"""Readers of files that other people made, for fuzzing: `python -m tests.fuzz.readers NAME SECONDS SEED FOLDER`.
+"""Readers of files that other people made, for fuzzing: `python -m tests.fuzz.readers SECONDS SEED [NAME...]`.
 
-A reader takes the path of a file. Its seeds are whole files, from which the fuzzer starts. Run as a program, this
-module fuzzes one reader with atheris (libFuzzer), which keeps inputs that reach new code. A case must end in success or
-with an `EyerenderError` of one line. Anything else, and a case that takes too long, ends the process with an exit code
-that is not 0, and leaves the input in the folder.
+A reader takes the path of a file. Its seeds are whole files, which are mutated. A case must end in success or with an
+`EyerenderError` of one line, within limits of memory and time (`tests/support/fuzzing.py`). Run as a program, this
+module fuzzes each reader for some seconds of processor time, prints the number of cases and every failure, and with
+`--guided FOLDER` lets atheris (libFuzzer) mutate one reader's files, which keeps inputs that reach new code.
 """
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
 import os
-import shutil
-import sys
+import tempfile
 import time
+import traceback
 import zlib
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 
+from tests.fuzz.folders import FOLDERS
+from tests.fuzz.reader import Reader, beside_metadata, folder_seeds, png_seeds, record_seeds, suppress_input
+from tests.fuzz.small import SMALL
+from tests.support.fuzzing import mutated, proper
+
 ROOT = Path(__file__).resolve().parents[2]
 LONGEST_BYTES = 8192
-
-
-@dataclass(frozen=True)
-class Reader:
-    """How a file with a name is read; `folder` lays out what must be beside it."""
-
-    name: str
-    read: Callable[[Path], Any]
-    seeds: Callable[[], list[bytes]]
-    beside: Callable[[Path], Any] | None = None
-
-    def case(self, data: bytes, folder: Path) -> Any:
-        """Read a file with some content, in a folder of its own."""
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        if self.beside is not None:
-            self.beside(folder)
-        (folder / self.name).write_bytes(data)
-        return self.read(folder / self.name)
 
 
 def _scene(path: Path) -> Any:
@@ -81,16 +67,6 @@ def _records(path: Path) -> Any:
     return load_observations(path, "guestrin2006")
 
 
-def _record_seeds() -> list[bytes]:
-    from eyerender.analytic.observer import trace
-    from eyerender.scene import load_scene
-
-    found = trace(load_scene("guestrin2006"), boundary_points=6)
-    records = list(found.take([0, 1]).records())
-    line = json.dumps(records[0]).encode()
-    return [line, line + b"\n" + line, json.dumps({"schema": "eyerender/features/1", "records": records[:1]}).encode()]
-
-
 def _table(path: Path) -> Any:
     from eyerender.gaze.records import load_observations
 
@@ -109,40 +85,10 @@ def _folder(path: Path) -> Any:
     return folder.truth()
 
 
-def _folder_seeds() -> list[bytes]:
-    record = json.loads(_record_seeds()[0])
-    line: dict[str, Any] = {"schema": "eyerender/image/5", "file_name": "images/a.png", "mask_file_name": "masks/a.png"}
-    line |= {"window_px": {"x0": 0, "y0": 0, "width": 4, "height": 4}, "bit_depth": 8, "gamma": 1.0}
-    both: list[dict[str, Any]] = [{"records": [record], "labels": {}}, {"records": []}]
-    return [json.dumps({**line, **more}).encode() for more in both]
-
-
-def _beside_metadata(folder: Path) -> None:
-    from eyerender.folders.imagefile import write_png
-
-    (folder / "dataset.json").write_text(json.dumps({"schema": "eyerender/dataset/1"}), encoding="utf-8")
-    for kind in ("images", "masks"):
-        (folder / kind).mkdir()
-        write_png(folder / kind / "a.png", np.zeros((4, 4), np.uint8))
-
-
-def suppress_input() -> Any:
-    from eyerender.base.errors import InputError
-
-    return suppress(InputError)
-
-
 def _image(path: Path) -> Any:
     from eyerender.folders.imagefile import read_any_image
 
     return read_any_image(path)
-
-
-def _png_seeds() -> list[bytes]:
-    from eyerender.folders.imagefile import png_bytes
-
-    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
-    return [png_bytes(grey), png_bytes(grey.astype(np.uint16) * 999), png_bytes(np.dstack([grey] * 3))]
 
 
 def _map(path: Path) -> Any:
@@ -352,12 +298,12 @@ READERS: dict[str, Reader] = {
     "scene": Reader("a.yaml", _scene, lambda: _shipped("scene")),
     "dataset": Reader("a.yaml", _dataset, lambda: _shipped("dataset")),
     "eye": Reader("a.yaml", _eye, lambda: _shipped("eye")),
-    "records": Reader("a.json", _records, _record_seeds),
+    "records": Reader("a.json", _records, record_seeds),
     "table": Reader("a.csv", _table, lambda: [b"x,y,gx,gy\n320.5,240,300,200\n1,2,,nan\n"]),
-    "folder": Reader("metadata.jsonl", _folder, _folder_seeds, _beside_metadata),
-    "benchmark": Reader("metadata.jsonl", _benchmark, _folder_seeds, _beside_metadata),
-    "study": Reader("metadata.jsonl", _study, _folder_seeds, _beside_metadata),
-    "png": Reader("a.png", _image, _png_seeds),
+    "folder": Reader("metadata.jsonl", _folder, folder_seeds, beside_metadata),
+    "benchmark": Reader("metadata.jsonl", _benchmark, folder_seeds, beside_metadata),
+    "study": Reader("metadata.jsonl", _study, folder_seeds, beside_metadata),
+    "png": Reader("a.png", _image, png_seeds),
     "exr": Reader("a.exr", _map, _exr_seeds),
     "hdr": Reader("a.hdr", _map, _hdr_seeds),
     "pfm": Reader("a.pfm", _map, _pfm_seeds),
@@ -373,23 +319,37 @@ READERS: dict[str, Reader] = {
     "cached-map": Reader("a.map", _cached_map, _cached_map_seeds),
     "shard": Reader("a.json", _done, _done_seeds),
     "run": Reader("run.json", _run_file, _run_file_seeds),
+    **FOLDERS,
+    **SMALL,
 }
 
 
 def _compiled() -> list[str]:
     """Return the modules with functions that numba compiles, which it cannot if they are instrumented."""
     package = ROOT / "eyerender"
-    sources = [*package.glob("extraction/**/*.py"), *package.glob("*/*kernels.py")]
+    sources = [*package.glob("extraction/**/*.py"), *package.glob("optics/*.py"), *package.glob("*/*kernels.py")]
     return [".".join(source.relative_to(ROOT).with_suffix("").parts) for source in sources]
 
 
-def main(name: str, seconds: str, seed: str, place: str) -> None:
-    """Fuzz one reader."""
+def fuzz(name: str, seconds: float, seed: int, folder: Path) -> tuple[int, list[str]]:
+    """Read mutated files for some seconds of processor time: the number of cases, and each failure with its input."""
+    rng, reader = Random(f"{name} {seed}"), READERS[name]
+    seeds, failures, count, end = reader.seeds(), dict[str, str](), 0, time.process_time() + seconds
+    while time.process_time() < end and len(failures) < 5:
+        data, count = mutated(rng.choice(seeds), rng)[:LONGEST_BYTES], count + 1
+        try:
+            proper(lambda data=data: reader.case(data, folder / "case"))  # type: ignore[misc]
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            failures.setdefault(f"{at.filename}:{at.lineno}", f"{at.filename}:{at.lineno}: {error!r}: {data!r}"[:2000])
+    return count, list(failures.values())
+
+
+def guided(name: str, seconds: float, seed: int, folder: Path) -> None:
+    """Fuzz one reader with the coverage of its code as the guide; a failure ends the process and leaves its input."""
     import atheris
 
-    from tests.support.fuzzing import proper
-
-    reader, folder = READERS[name], Path(place)
+    reader = READERS[name]
     with atheris.instrument_imports(include=["eyerender"], exclude=_compiled()):
         seeds = reader.seeds()
         for data in seeds:  # imports what the reader needs, so that it is instrumented
@@ -399,7 +359,7 @@ def main(name: str, seconds: str, seed: str, place: str) -> None:
         (folder / "corpus" / str(k)).write_bytes(data)
     options = {"seed": seed, "max_len": str(LONGEST_BYTES), "len_control": "0", "artifact_prefix": f"{folder}/"}
     options |= {"rss_limit_mb": "0", "malloc_limit_mb": "0", "timeout": "60"}
-    runs, end = itertools.count(), time.monotonic() + float(seconds)
+    runs, end = itertools.count(), time.monotonic() + seconds
 
     def one(data: bytes) -> None:
         count = next(runs)
@@ -412,5 +372,25 @@ def main(name: str, seconds: str, seed: str, place: str) -> None:
     atheris.Fuzz()
 
 
+def main() -> None:
+    """Fuzz the readers that the command line names, or all."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--guided", type=Path)
+    given = parser.parse_args()
+    if given.guided is not None:
+        return guided(given.names[0], given.seconds, given.seed, given.guided)
+    total = 0
+    for name in given.names or READERS:
+        with tempfile.TemporaryDirectory() as folder:
+            count, failures = fuzz(name, given.seconds, given.seed, Path(folder))
+        total += count
+        print(name, count, *failures, sep="\n  ", flush=True)
+    print(f"{total} cases", flush=True)
+    return None
+
+
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -12,7 +12,7 @@ import json
 import resource
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from random import Random
 from typing import Any
 
@@ -165,6 +165,18 @@ SNIPPETS = (
     b"[" * 500, b"{" * 500, b"\x00", b"\xff\xfe", b"'", b"\t", b"%YAML 9.9\n", b"---\n", b"1" * 5000, b"2020-13-45",
     b"1:1:1:1", b"0x", b"? ", b"NaN", b"Infinity", b"1e999", b'"\\ud800"', b"null", b"\n" * 50,
 )  # fmt: skip
+
+
+def mutated(data: bytes, rng: Random) -> bytes:
+    """A file with edits: of its values if it is JSON, or of a line of it that is, else of its bytes."""
+    lines = data.splitlines(keepends=True)
+    k = rng.randrange(len(lines)) if lines else 0
+    for first, end in ((0, len(lines)), (k, k + 1)):
+        if rng.random() < 0.6:
+            with suppress(ValueError, RecursionError, OverflowError):
+                lines[first:end] = [json.dumps(edited(json.loads(b"".join(lines[first:end])), rng)).encode() + b"\n"]
+                return b"".join(lines)
+    return garbled(data, rng)
 
 
 def garbled(data: bytes, rng: Random) -> bytes:

@@ -19,7 +19,7 @@ from pathlib import Path
 from ...base.errors import InputError
 from ...base.processes import python_command, run
 from ...base.references import is_reference
-from ...base.storage.files import read_bytes
+from ...base.storage.files import MAX_FILE_BYTES, appended, read_bytes, read_text, write_text
 from ...folders.imagefolder import versions
 from ...folders.outfolder import mark
 from .labelled import BenchImage
@@ -41,8 +41,8 @@ class Answers:
         self._first = json.dumps({"schema": _SCHEMA, "task": task})
         self._known: dict[tuple[str, int], tuple[str, str, float]] = {}
         lines: list[str] = []
-        with suppress(OSError, UnicodeDecodeError):
-            lines = [] if path is None or fresh else path.read_text(encoding="utf-8").splitlines()
+        with suppress(InputError):
+            lines = [] if path is None or fresh else read_text(path, limit=MAX_FILE_BYTES, follow=False).splitlines()
         for line in lines[1:] if lines[:1] == [self._first] else ():
             with suppress(ValueError, TypeError):  # the last line of a killed run may be truncated
                 extractor, row, text, greeting, trip_s = json.loads(line)
@@ -65,10 +65,10 @@ class Answers:
             self._known |= new
             if not self._begun:
                 mark(self._path.parent, {self._path.name})
-                self._path.write_text(self._first + "\n", encoding="utf-8")
+                write_text(self._path, self._first + "\n", sync=False)
                 self._begun, new = True, self._known
-            with open(self._path, "a", encoding="utf-8") as file:
-                file.writelines(json.dumps([*key, *value]) + "\n" for key, value in new.items())
+            with appended(self._path) as file:
+                file.writelines(json.dumps([*key, *value]).encode() + b"\n" for key, value in new.items())
 
 
 def image_key(image: BenchImage) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.storage.files import read_json, shown
 from .intervals import mcnemar
 
@@ -97,12 +97,15 @@ def compare_with(old: dict[str, Any], new: dict[str, Any], source: str) -> list[
     shared = {name for name, digest in new["image_digests"].items() if digests.get(name) == digest}
     if not shared:
         raise InputError("shares no image with this bench", source=source)
-    before = {entry["name"]: entry for entry in old["extractors"]}
+    try:
+        before = {entry["name"]: _successes(entry, shared) for entry in old["extractors"]}
+    except WRONG as error:
+        raise InputError(f"is not complete ({type(error).__name__}: {error})", source=source) from None
     out = []
     for entry in new["extractors"]:
         if entry["name"] not in before:
             continue
-        was, now = (_successes(e, shared) for e in (before[entry["name"]], entry))
+        was, now = before[entry["name"]], _successes(entry, shared)
         lost = sorted(name for name in shared if was[name] and not now[name])
         gained = sorted(name for name in shared if now[name] and not was[name])
         p = mcnemar(len(lost), len(gained))
@@ -144,4 +147,5 @@ def problems_of(data: dict[str, Any], gated: bool) -> list[str]:
 
 
 def _successes(entry: dict[str, Any], shared: set[str]) -> dict[str, bool]:
-    return {a["image"]: a["outcome"] in ("right", "absent") for a in entry["answers"] if a["image"] in shared}
+    found = {a["image"]: a["outcome"] in ("right", "absent") for a in entry["answers"]}
+    return {image: found[image] for image in shared}

@@ -15,8 +15,8 @@ centre outside of the frame means that nobody labelled it, so it is left out.
 
 from __future__ import annotations
 
-import csv
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -26,9 +26,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from ...base.arrays import Bools
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.storage.arrays import mapped_array
-from ...base.storage.files import inside, read_json, read_text
+from ...base.storage.files import inside, is_plain, read_json, read_table, read_text
 from ...folders.exported import EXPORT, exported_gamma
 from ...folders.video import unpacked
 from ...optics.ellipse import Ellipse
@@ -97,7 +97,7 @@ def _subjects(table: Path, key: str) -> dict[str, str]:
     """Read the subject of every file from a table of an export; empty without the table."""
     if not table.is_file():
         return {}
-    return {str(row.get(key)): str(row.get("subject") or "") for row in csv.DictReader(read_text(table).splitlines())}
+    return {str(row.get(key)): row.get("subject", "") for row in read_table(table)}
 
 
 def _coco(folder: Path) -> Iterator[BenchImage]:
@@ -126,9 +126,7 @@ def _coco(folder: Path) -> Iterator[BenchImage]:
                 name = path.relative_to(folder).as_posix()
                 subject = str(image.get("subject", ""))
                 yield BenchImage.read(name, path, pupil, glints=glints, subject=subject)
-        except InputError:
-            raise
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        except WRONG as error:
             raise InputError(f"is not COCO's ({type(error).__name__}: {error})", source=source) from None
 
 
@@ -136,7 +134,7 @@ def _coco_image(folder: Path, file: Path, name: str) -> Path:
     """Return the file of an image: beside the annotations' folder, or in a folder named as the split or `images`."""
     split = file.stem.removeprefix("instances_")
     for home in (folder / split, folder / "images", folder):
-        if (home / name).is_file():
+        if is_plain(name) and os.path.isfile(home / name):
             return inside(home, name, source=str(file))
     raise InputError(f"there is no image {name}", source=str(file))
 
@@ -171,7 +169,7 @@ def _decoded(counts: Any, shape: tuple[int, int], source: str) -> Bools:
     if isinstance(counts, str):
         raise InputError("has compressed run lengths, which are not read", source=source)
     runs = np.asarray(counts, dtype=np.int64)
-    if np.any(runs < 0) or int(runs.sum()) != shape[0] * shape[1]:
+    if np.any((runs < 0) | (runs > _MOST_PIXELS)) or int(runs.sum()) != shape[0] * shape[1]:
         raise InputError("has run lengths of another size", source=source)
     return np.asarray(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(shape, order="F"))
 

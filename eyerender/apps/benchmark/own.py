@@ -13,10 +13,8 @@ frame of a video.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +22,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Ints
 from ...base.errors import InputError
-from ...base.storage.files import inside, read_text
+from ...base.storage.files import inside, read_table
 from ...folders.imagefile import read_any_image
 from ...folders.imagefolder import DATASET, RUN
 from ...folders.video import unpacked
@@ -72,42 +70,31 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
     if not (folder / GLINTS).is_file():
         return out
     source = str(folder / GLINTS)
-    lines = _lines(folder / GLINTS, ("image", "x_px", "y_px"))
-    for k, line in enumerate(lines):
+    for k, line in enumerate(read_table(folder / GLINTS, ("image", "x_px", "y_px"))):
         try:
             x, y, light = float(line["x_px"]), float(line["y_px"]), int(line.get("light") or -1)
-        except (TypeError, ValueError):
+        except (KeyError, ValueError):
             raise InputError("needs numbers", source=source, path=f"line {k + 2}") from None
         if not (math.isfinite(x + y) and max(abs(x), abs(y)) < 1e5):
             raise InputError("is not a position in an image", source=source, path=f"line {k + 2}")
-        out.setdefault(str(line["image"]), []).append(TrueGlint(light, (x, y)))
+        out.setdefault(line["image"], []).append(TrueGlint(light, (x, y)))
     return out
 
 
 def _of_table(folder: Path) -> Iterator[BenchImage]:
     source = str(folder / LABELS)
-    lines = _lines(folder / LABELS, ("image", *COLUMNS))
     videos: dict[Path, list[Path]] = {}
-    for k, line in enumerate(lines):
+    for k, line in enumerate(read_table(folder / LABELS, ("image", *COLUMNS))):
         where = f"line {k + 2}"
         if k >= MAX_IMAGES:
             raise InputError(f"has more than {MAX_IMAGES} lines", source=source)
         name = line["image"]
-        home = folder / IMAGES if (folder / IMAGES).is_dir() and not (name or "").startswith(f"{IMAGES}/") else folder
-        path = _image_or_frame(home, str(name), videos, (source, where))
-        cells = [line[column] for column in COLUMNS]
+        home = folder / IMAGES if (folder / IMAGES).is_dir() and not name.startswith(f"{IMAGES}/") else folder
+        path = _image_or_frame(home, name, videos, (source, where))
+        cells = [line.get(column, "") for column in COLUMNS]
         pupil = _ellipse(cells, source, where) if any(cells) else None
         visible = _share(line.get("visible"), source, where)
-        yield BenchImage.read(str(name), path, pupil, visible=visible, subject=str(line.get("subject") or ""))
-
-
-def _lines(table: Path, columns: Sequence[str]) -> csv.DictReader[str]:
-    """Read a table that must have some columns."""
-    lines = csv.DictReader(io.StringIO(read_text(table)))
-    missing = sorted(set(columns) - set(lines.fieldnames or ()))
-    if missing:
-        raise InputError(f"has no column {missing[0]}", source=str(table))
-    return lines
+        yield BenchImage.read(name, path, pupil, visible=visible, subject=line.get("subject", ""))
 
 
 def _image_or_frame(home: Path, name: str, videos: dict[Path, list[Path]], at: tuple[str, str]) -> Path:

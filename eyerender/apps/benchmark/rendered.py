@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.storage.files import inside, read_json
 from ...base.storage.jsonlines import JsonLines
 from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
@@ -55,8 +55,12 @@ def rendered_images(folder: Path, eye_error_mm: float) -> list[BenchImage]:
                 path=f"line {k + 1}",
             )
         # There is one record per image, so an image's row in the truth is its number.
-        hints = _hints(entry, truth, k, scene_rig, eye_error_mm)
-        out.append(replace(_rendered(entry, truth, k), hints=hints))
+        try:
+            hints = _hints(entry, truth, k, scene_rig, eye_error_mm)
+            out.append(replace(_rendered(entry, truth, k), hints=hints))
+        except WRONG as error:
+            reason = f"has labels that cannot be used ({type(error).__name__}: {error})"
+            raise InputError(reason, source=str(folder / METADATA), path=f"line {k + 1}") from None
     return out
 
 
@@ -207,9 +211,7 @@ def ideal_images(folder: Path) -> list[BenchImage]:
         try:
             path = inside(folder, line["file_name"], source=source, path=f"line {k + 1}.file_name")
             out.append(_ideal(path, line["file_name"], line["records"][0], line["parameters"]))
-        except InputError:
-            raise
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+        except WRONG:
             raise InputError("is not an image record", source=source, path=f"line {k + 1}") from None
     if not out:
         raise InputError("holds no images", source=source)
@@ -217,7 +219,9 @@ def ideal_images(folder: Path) -> list[BenchImage]:
 
 
 def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, Any]) -> BenchImage:
-    label = record["pupil"]
+    label, depth = record["pupil"], int(said["bit_depth"])
+    if not 1 <= depth <= 32:
+        raise ValueError("bit_depth")
     pupil = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"]) if label["status"] == "ok" else None
     visible = said.get("visible_fraction")
     if visible is None and not said["lid"]:
@@ -227,8 +231,14 @@ def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, 
         path,
         pupil,
         visible=visible,
-        bit_depth=int(said["bit_depth"]),
-        glints=tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == "ok"),
+        bit_depth=depth,
+        glints=tuple(_glint(g["light"], *g["xy_px"]) for g in record["glints"] if g["status"] == "ok"),
         hints=NO_HINTS | {"polarity": said["polarity"]},
         known={key: float(said[key]) for key in ("noise_dn", "blur_px", "step_dn")},
     )
+
+
+def _glint(light: Any, x: Any, y: Any) -> TrueGlint:
+    if not max(abs(x), abs(y)) < 1e5:
+        raise ValueError("xy_px")
+    return TrueGlint(int(light), (float(x), float(y)))

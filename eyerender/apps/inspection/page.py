@@ -12,9 +12,8 @@ import numpy as np
 from PIL import Image
 
 from ...base.arrays import Bytes, Ints
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...dataset.export.encoding import Encoding, measured_gain
-from ...dataset.validation.problems import WRONG
 from ...folders.imagefolder import ImageEntry
 from ...report.overlay import picture
 from ...report.page import Card, Content, Figure, Gallery, Key, Page, Section, Table, write_page

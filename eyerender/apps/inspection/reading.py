@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Bytes, Ints, Objects, Singles
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.processes import ordered
 from ...base.progress import Progress, notify
-from ...dataset.validation.problems import WRONG
 from ...folders.imagefolder import Entries, ImageEntry, ImageFolder, opened_entries
 from ...folders.packed import PackedLines
 from .faults import Fault

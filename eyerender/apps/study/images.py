@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Ints, frozen
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.progress import Progress, Say
 from ...base.storage.files import read_json
 from ...base.storage.jsonlines import JsonLines
@@ -228,7 +228,7 @@ def read_images(folder: Path) -> StudyImages | None:
             for scene, name in _exposures(line):
                 entry = ImageEntry(folder=folder, line={"file_name": name, **kept})
                 found.setdefault(_digest_of(scene, eye, level is not None), []).append((frame, entry))
-    except (InputError, ValueError, KeyError, TypeError, IndexError):
+    except (InputError, *WRONG):
         return None
     # A dataset's lines need not be in the order of its samples.
     in_order = {key: sorted(those, key=lambda pair: pair[0]) for key, those in found.items()}

@@ -21,7 +21,7 @@ import stat
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from io import BufferedReader
+from io import BufferedRandom, BufferedReader
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -280,23 +280,38 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
     Raises:
         InputError: the file is missing, not regular (a pipe, a device, a folder), too large, or not readable.
     """
+    with open(_regular(path, os.O_RDONLY, follow), "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise InputError(f"is too large ({_size(size)}; at most {_size(limit)} is read)", source=str(path))
+        yield file
+
+
+def appended(path: str | Path) -> BufferedRandom:
+    """Open a regular file, which is not a link, for appending and reading; create it if it is missing.
+
+    Raises:
+        InputError: the path is a link, or something else than a file, or cannot be opened.
+    """
+    return open(_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False), "ab+")
+
+
+def _regular(path: str | Path, flags: int, follow: bool) -> int:
+    """Open a regular file and return its handle; raises `InputError` like `opened`."""
     source = str(path)
     try:
         # Opening a pipe for reading would wait for a writer.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
-        handle = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
+        flags |= getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+        handle = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)), 0o644)
     except OSError as error:
         raise InputError(_why_unreadable(path, error), source=source) from None
     except ValueError:
         raise InputError("is not a valid file name", source=source) from None
-    state = os.fstat(handle)
-    if not stat.S_ISREG(state.st_mode):
+    mode = os.fstat(handle).st_mode
+    if not stat.S_ISREG(mode):
         os.close(handle)
-        raise InputError(f"is {_kind(state.st_mode)}, not a file", source=source)
-    with open(handle, "rb") as file:
-        if state.st_size > limit:
-            raise InputError(f"is too large ({_size(state.st_size)}; at most {_size(limit)} is read)", source=source)
-        yield file
+        raise InputError(f"is {_kind(mode)}, not a file", source=source)
+    return handle
 
 
 def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
@@ -325,6 +340,29 @@ def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = T
         return data.decode()
     except UnicodeDecodeError:
         raise InputError("cannot be read (not UTF-8 text)", source=str(path)) from None
+
+
+def read_table(
+    path: str | Path, columns: Iterable[str] = (), *, limit: int = MAX_TEXT_BYTES
+) -> Iterator[dict[str, str]]:
+    """Yield the rows of a CSV file with a header as mappings; a short row has only its first columns.
+
+    Raises:
+        InputError: as `read_text`; the file is not valid CSV, lacks one of `columns`, or a row is too long.
+    """
+    source = str(path)
+    reader = csv.reader(io.StringIO(read_text(path, limit=limit), newline=""))
+    try:
+        header = next(reader, [])
+        for name in sorted(set(columns) - set(header)):
+            raise InputError(f"has no column {name}", source=source)
+        for row in filter(None, reader):
+            if len(row) > len(header):
+                reason = f"has {len(row)} cells; the header has {len(header)}"
+                raise InputError(reason, source=source, path=f"line {reader.line_num}")
+            yield dict(zip(header, row, strict=False))
+    except csv.Error as error:
+        raise InputError(f"is not valid CSV: {error}", source=source, path=f"line {reader.line_num}") from None
 
 
 def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:

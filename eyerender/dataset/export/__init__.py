@@ -13,14 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json, write_text
 from ...folders.exported import EXPORT
 from ...folders.imagefolder import ImageFolder
 from ...folders.outfolder import staged
 from ..assemble import verify_dataset
-from ..validation.problems import WRONG
 from . import coco, ellseg, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
 from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain

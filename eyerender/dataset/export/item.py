@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bytes, Floats, Ints
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.processes import ordered
 from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, opened_entries
 from ...optics.ellipse import Ellipse, signed_distance
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
 from ..selection import scrambled
-from ..validation.problems import WRONG
 from .encoding import RAW, Encoding
 
 Prepared = TypeVar("Prepared")

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Ints
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.status import Status
 from ...base.storage.files import shown
 from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ...rig.plausibility import EXPOSURE_REMEDY
 from ...scene.observation import Observations
-from .problems import WRONG, FolderProblems
+from .problems import FolderProblems
 from .shards import hashed
 from .truth import DatasetTruth, SceneTruth
 

@@ -10,7 +10,6 @@ from typing import Any
 SHOWN = 50
 MAX_LENGTH = 400
 # Exceptions that reading a wrong value may raise.
-WRONG = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError)
 
 
 class FolderProblems:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...analytic.observer import trace
 from ...base.arrays import Bools, Floats
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ...base.storage.files import parse_json, shown
 from ...folders.imagefolder import DATASET, FILE_KEYS, KINDS, RESULTS, ImageFolder, shard_name, versions
 from ...imaging.labels import EyeInWindow, known_labels, limbus_px
@@ -32,7 +32,7 @@ from ..done import picture_file
 from ..ownscenes import GivenScene
 from ..plan import Plan, plan_digest
 from ..realise import Realised, frames_of, image_name, realise, sample_line
-from .problems import WRONG, FolderProblems, differences
+from .problems import FolderProblems, differences
 
 # Rays are traced to 1e-9 mm, and mathematical functions of other machines change the last digits: 1e-8 px at the
 # sharpest of the shipped cameras. A number may differ by this times 1 + its size.
