@@ -362,6 +362,8 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        if isinstance(node, yaml.ScalarNode) and _SURROGATE.search(node.value):
+            raise yaml.constructor.ConstructorError(None, None, "half of a surrogate pair", node.start_mark)
         if node.tag in _NUMBERS and isinstance(node, yaml.ScalarNode) and len(node.value) > _LONGEST_NUMBER:
             raise yaml.constructor.ConstructorError(
                 None, None, f"a number of {len(node.value)} characters", node.start_mark
@@ -405,6 +407,7 @@ def _as_mapping(loader: Any, node: Any) -> Any:
 
 # YAML 1.1 reads 010 as 8 and 66:40 as 4000; nobody who writes them means that.
 _SURPRISING = re.compile(r"^[-+]?(0[0-9_]+$|[0-9_]+:)")
+_SURROGATE = re.compile("[\ud800-\udfff]")  # an escape may name one, but no file could hold it
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 # YAML 1.1 reads 1e-3 as text, but everybody means the number.
 _UniqueKeyLoader.add_implicit_resolver(

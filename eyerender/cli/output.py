@@ -24,7 +24,7 @@ PATIENCE_S = 2.0
 def say(text: str) -> None:
     """Print a line of the log on stderr."""
     # In one write: an interrupt between text and line end would join two lines.
-    sys.stderr.write(f"{text}\n")
+    sys.stderr.write(printable(text, keep="\n\t") + "\n")
     sys.stderr.flush()
 
 
@@ -81,7 +81,12 @@ def progress(what: str) -> Iterator[Progress]:
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bars
 
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
         with Bars(*columns, console=Console(stderr=True), transient=False) as bar:
             task = bar.add_task(what, total=None)
             yield lambda done, total, note: bar.update(task, completed=done, total=total, description=f"{what}: {note}")

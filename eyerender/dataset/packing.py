@@ -49,7 +49,7 @@ def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
         OSError: the disk is full or not writable.
         EyerenderError: the same.
     """
-    lines = [parse_json(raw) for raw in read_bytes(stage / SHARD / LINES).splitlines()]
+    lines = [parse_json(raw) for raw in read_bytes(stage / SHARD / LINES, follow=False).splitlines()]
     samples = np.array([line["sample"] for line in lines], dtype=np.int64)
     lines = [lines[k] for k in np.lexsort((np.arange(len(lines)), scrambled(samples, seed)))]
     with written(stage / SHARD / TAR) as file:
@@ -127,7 +127,7 @@ def _write_tar(stage: Path, lines: list[dict[str, Any]], file: Any) -> None:
             for kind, key in KINDS.items():
                 if line.get(key) is not None:
                     path = PurePosixPath(line[key])
-                    data = read_bytes(stage / kind / path.name)
+                    data = read_bytes(stage / kind / path.name, follow=False)
                     own[key] = [tar.offset + tarfile.BLOCKSIZE, len(data)]  # behind the header
                     add_member(tar, f"{path.stem}{ENDINGS[kind]}{path.suffix}", data)
 

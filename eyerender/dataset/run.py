@@ -302,7 +302,7 @@ class Run:
         if missing:
             return missing, None
         if intact:
-            found: dict[str, Any] = read_json(self.folder / DATASET, limit=MAX_FILE_BYTES)["statistics"]
+            found: dict[str, Any] = read_json(self.folder / DATASET, limit=MAX_FILE_BYTES, follow=False)["statistics"]
             return missing, found
         with final_lock(self.folder, self.say):
             if self._verifies:

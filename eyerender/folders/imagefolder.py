@@ -596,7 +596,7 @@ def _is_whole(value: object) -> TypeGuard[int]:
 def same_run(path: str | Path, digest: str) -> bool:
     """Return whether a folder already holds the complete result of the same spec and versions."""
     try:
-        found = read_json(Path(path) / DATASET)
+        found = read_json(Path(path) / DATASET, follow=False)
     except InputError:
         return False
     return bool(

@@ -18,6 +18,7 @@ ANALYTIC_ON_DARK, IMAGE_ON_DARK = "#56B4E9", "#FF9F1C"
 _RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10,
+    "text.parse_math": False,  # names from files are no formulas
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -40,6 +41,15 @@ def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iter
         fig = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasSVG(fig)
         yield fig, fig.subplots(rows, columns)
+
+
+def log_scale(axis: Any) -> None:
+    """Make an axis (`ax.xaxis`) logarithmic, with labels that are plain numbers and not formulas."""
+    from matplotlib.ticker import LogFormatter
+
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    axis.set_major_formatter(LogFormatter())
+    axis.set_minor_formatter(LogFormatter())
 
 
 def legend_above(fig: Any, panel: Any, columns: int) -> None:

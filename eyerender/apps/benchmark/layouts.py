@@ -97,14 +97,14 @@ def _subjects(table: Path, key: str) -> dict[str, str]:
     """Read the subject of every file from a table of an export; empty without the table."""
     if not table.is_file():
         return {}
-    return {str(row.get(key)): row.get("subject", "") for row in read_table(table)}
+    return {str(row.get(key)): row.get("subject", "") for row in read_table(table, follow=False)}
 
 
 def _coco(folder: Path) -> Iterator[BenchImage]:
     files = sorted((folder / "annotations").glob("*.json"))
     # Files of keypoints or captions stand beside those of instances, as in the public COCO data.
     for file in [file for file in files if file.name.startswith("instances")] or files:
-        data, source = read_json(file, limit=_ANNOTATIONS_BYTES), str(file)
+        data, source = read_json(file, limit=_ANNOTATIONS_BYTES, follow=False), str(file)
         try:
             categories = {str(c["name"]).lower(): c["id"] for c in data["categories"]}
             marks: dict[Any, list[Mapping[str, Any]]] = {}
@@ -234,7 +234,7 @@ def _excuse(folder: Path) -> Iterator[BenchImage]:
 
 def _rows(table: Path, count: int, *, heading: bool = False) -> Iterator[tuple[str, list[float]]]:
     """Yield the place (`line N`) and the first numbers of each line of a table, separated by spaces or semicolons."""
-    for k, line in enumerate(read_text(table).splitlines()[: MAX_IMAGES + heading], start=1):
+    for k, line in enumerate(read_text(table, follow=False).splitlines()[: MAX_IMAGES + heading], start=1):
         if not line.strip() or (heading and k == 1):
             continue
         try:

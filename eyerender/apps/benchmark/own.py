@@ -70,7 +70,7 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
     if not (folder / GLINTS).is_file():
         return out
     source = str(folder / GLINTS)
-    for k, line in enumerate(read_table(folder / GLINTS, ("image", "x_px", "y_px"))):
+    for k, line in enumerate(read_table(folder / GLINTS, ("image", "x_px", "y_px"), follow=False)):
         try:
             x, y, light = float(line["x_px"]), float(line["y_px"]), int(line.get("light") or -1)
         except (KeyError, ValueError):
@@ -84,7 +84,7 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
 def _of_table(folder: Path) -> Iterator[BenchImage]:
     source = str(folder / LABELS)
     videos: dict[Path, list[Path]] = {}
-    for k, line in enumerate(read_table(folder / LABELS, ("image", *COLUMNS))):
+    for k, line in enumerate(read_table(folder / LABELS, ("image", *COLUMNS), follow=False)):
         where = f"line {k + 2}"
         if k >= MAX_IMAGES:
             raise InputError(f"has more than {MAX_IMAGES} lines", source=source)

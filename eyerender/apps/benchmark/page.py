@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...optics.ellipse import Ellipse
 from ...report.page import Card, Figure, Page, Section, Table, number, write_page
-from ...report.style import TARGET, error_panel, figure, legend_above, svg
+from ...report.style import TARGET, error_panel, figure, legend_above, log_scale, svg
 
 Row = dict[str, Any]
 Format = Callable[[Any], str]
@@ -163,7 +163,7 @@ def cumulative_figure(data: Row, rows: Sequence[Row]) -> str:
             x = np.geomspace(bounds.min() * 0.05, bounds.max() * 5.0, 200)
             share = (1.0 - np.exp(-0.5 * (x[:, None] / bounds) ** 2)).mean(axis=1)
             ax.plot(x, share, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
-        ax.set_xscale("log")
+        log_scale(ax.xaxis)
         ax.set(xlabel="pupil centre error (px)", ylabel="share of the images", ylim=(0, 1.02))
         if names:
             fig.legend(loc="outside upper center", ncols=4, frameon=False)
@@ -241,7 +241,7 @@ def factor_figure(data: Row, name: str) -> str:
         if any(b is not None for b in bound):
             y = [np.nan if b is None else b for b in bound]
             axes[0].plot([b["median"] for b in bins], y, color=TARGET, lw=1.2, ls="--", label="Cramér-Rao bound")
-        axes[0].set_yscale("log")
+        log_scale(axes[0].yaxis)
         axes[0].set(ylabel="median centre error (px)")
         axes[1].set(ylabel="share of pupils right", ylim=(-0.03, 1.05))
         for ax in axes:

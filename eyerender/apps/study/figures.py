@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
-from ...report.style import figure, legend_above, svg
+from ...report.style import figure, legend_above, log_scale, svg
 from .featureclouds import Cloud
 
 _LOOK = {
@@ -109,7 +109,7 @@ def sets_figure(
             for model, values in by_model.items():
                 colour, marker = look(model, list(by_model))
                 ax.plot(x, values, color=colour, marker=marker, ms=6, lw=1.2, label=model)
-            ax.set_yscale("log")
+            log_scale(ax.yaxis)
             ax.set_ylim(0.02, top)
             ticks = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
             ax.set_yticks(ticks, [f"{t:g}" for t in ticks])

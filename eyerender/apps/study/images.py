@@ -215,7 +215,7 @@ def read_images(folder: Path) -> StudyImages | None:
     from ...dataset.done import run_versions
 
     try:
-        dataset = read_json(folder / DATASET)
+        dataset = read_json(folder / DATASET, follow=False)
         if dataset["versions"] != run_versions():
             return None
         level = dataset["spec"].get("auto_exposure")
@@ -243,7 +243,7 @@ def _begun(folder: Path, plan: Any) -> bool:
     if not folder.exists():
         return True
     try:
-        found = read_json(folder / RUN)
+        found = read_json(folder / RUN, follow=False)
         return bool(found["digest"] == plan.digest and found["versions"] == run_versions())
     except (InputError, KeyError):
         return False

@@ -11,7 +11,7 @@ import numpy as np
 from ...base.arrays import Floats
 from ...design.people import GRID, LOST
 from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
-from ...report.style import figure, heat_map, svg
+from ...report.style import figure, heat_map, log_scale, svg
 
 
 def write_rigs_page(path: Path, data: Mapping[str, Any], maps: Mapping[str, Floats]) -> None:
@@ -114,7 +114,7 @@ def _buys(rows: Any) -> str:
         for row in rows:
             count, noise = (np.array([one[k] for one in row["leds"]], float) for k in ("leds", "axis_deg_median"))
             ax.plot(count, noise, marker="o", label=row["layout"])
-        ax.set_yscale("log")
+        log_scale(ax.yaxis)
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.set_xlabel("number of LEDs")
         ax.set_ylabel("noise of the optic axis (deg)")

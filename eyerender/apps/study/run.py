@@ -202,7 +202,7 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
         InputError: the folder holds something else, or another writer uses it.
     """
     try:
-        found = read_json(folder / MARKER)
+        found = read_json(folder / MARKER, follow=False)
         same = found.get("schema") == RUN_SCHEMA and found.get("settings", {}).get("study") == settings["study"]
     except (InputError, AttributeError):
         same = False

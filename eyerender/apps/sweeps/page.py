@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
-from ...report.style import ANALYTIC, IMAGE, figure, svg
+from ...report.style import ANALYTIC, IMAGE, figure, log_scale, svg
 
 _MOST_ROWS = 60
 _LITTLE = 0.05
@@ -97,7 +97,7 @@ def _plot(rows: Sequence[Mapping[str, Any]], key: str, label: str, factor: float
             x, y = (np.array([row[name] for row in some], dtype=float) for name in (key, "noise_deg"))
             ax.scatter(factor * x, y, color=color, s=size, alpha=0.8)
         if shown:
-            ax.set_yscale("log")
+            log_scale(ax.yaxis)
         ax.set_xlabel(label)
         ax.set_ylabel("noise of gaze (deg)")
         return svg(fig)

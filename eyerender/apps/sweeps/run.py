@@ -123,7 +123,7 @@ def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
         if overwrite and marker.is_file() and folder.is_dir():
             clear(folder)
         if marker.is_file():
-            if read_json(marker).get("sweep") != settings["sweep"]:
+            if read_json(marker, follow=False).get("sweep") != settings["sweep"]:
                 raise InputError("holds another sweep; choose another folder or give --overwrite", source=str(folder))
             return
         refuse_non_empty(folder, overwrite)
@@ -261,7 +261,7 @@ def _read(path: Path, number: int) -> dict[str, Any]:
     Raises:
         InputError: this package did not write the file.
     """
-    row = read_json(path)
+    row = read_json(path, follow=False)
     if row.get("schema") != LAYOUT_SCHEMA or row.get("number") != number or not row.keys() >= _KEYS:
         raise InputError(f"is not the result of layout {number}; remove it", source=str(path))
     return row

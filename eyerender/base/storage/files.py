@@ -343,7 +343,7 @@ def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES, follow: bool = T
 
 
 def read_table(
-    path: str | Path, columns: Iterable[str] = (), *, limit: int = MAX_TEXT_BYTES
+    path: str | Path, columns: Iterable[str] = (), *, limit: int = MAX_TEXT_BYTES, follow: bool = True
 ) -> Iterator[dict[str, str]]:
     """Yield the rows of a CSV file with a header as mappings; a short row has only its first columns.
 
@@ -351,7 +351,7 @@ def read_table(
         InputError: as `read_text`; the file is not valid CSV, lacks one of `columns`, or a row is too long.
     """
     source = str(path)
-    reader = csv.reader(io.StringIO(read_text(path, limit=limit), newline=""))
+    reader = csv.reader(io.StringIO(read_text(path, limit=limit, follow=follow), newline=""))
     try:
         header = next(reader, [])
         for name in sorted(set(columns) - set(header)):
@@ -379,7 +379,12 @@ def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
         hooks: dict[str, Any] = {}
         if any(long in zeros for long in _LONG):
             hooks = {"parse_int": _integer, "parse_float": _finite}
-        return json.loads(text, parse_constant=_refuse, **hooks)
+        found = json.loads(text, parse_constant=_refuse, **hooks)
+        if "\\ud" in text or "\\uD" in text:
+            json.dumps(found, ensure_ascii=False).encode()
+        return found
+    except UnicodeEncodeError:
+        raise InputError("is not valid JSON: half of a surrogate pair", source=source, path=path) from None
     except RecursionError:
         raise InputError("is not valid JSON: nested too deeply", source=source, path=path) from None
     except UnicodeDecodeError:

@@ -12,6 +12,7 @@ exact for every block that the horizon does not cut.
 from __future__ import annotations
 
 import math
+import os
 import re
 import struct
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from ...base.arrays import ArrayValue, Floats, frozen
 from ...base.errors import InputError
 from ...base.spec import file_digest
-from ...base.storage.files import opened
+from ...base.storage.files import opened, read_bytes
 from ...rig.imaging import RadianceMap
 from ...rig.surroundings import paint
 from ..scene.exr import second_thread
@@ -40,6 +41,9 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # 16384 x 8192, of which 1024 x 512 are used.
 MAX_MAP_PIXELS = 2**27
 _HEADER_BYTES = 65536
+# Values that a file may hold, by its size; compression of plain maps reaches 47 (.hdr), and of very plain ones more.
+_FEW_VALUES, _MOST_PER_BYTE = 2**26, 64
+_CHANNEL_BYTES = 18  # of a channel in the header of an OpenEXR file, at least
 _SIDES = {
     ".hdr": rb"[-+][XY] *([0-9]{1,20}) *[-+][XY] *([0-9]{1,20})",
     ".pfm": rb"^P[fF]\s+([0-9]{1,20})\s+([0-9]{1,20})\s",
@@ -77,20 +81,9 @@ def read_map(path: str | Path, channel: str = "red") -> Floats:
     source, path = str(path), Path(path)
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"must end with one of {', '.join(_FORMATS)}", source=source)
-    with opened(path) as file:
-        size = _size(path.suffix.lower(), file.read(_HEADER_BYTES))
-    if size == 0 or (size is None and path.suffix.lower() == ".pfm"):  # Mitsuba would divide by zero
-        raise InputError("is not a readable map (its header names no size)", source=source)
-    if size is not None and size > MAX_MAP_PIXELS:
-        raise InputError(f"has {size} pixels; at most {MAX_MAP_PIXELS}", source=source)
+    _refuse_size(path)
     try:
-        if path.suffix.lower() == ".npy":
-            with opened(path) as file:
-                data = np.lib.format.read_array(file, allow_pickle=False)
-        else:
-            with second_thread():
-                bitmap = mi.Bitmap(str(path))
-            data = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+        data = _decoded(path)
     except InputError:
         raise
     except Exception as error:
@@ -122,11 +115,35 @@ def _channel(data: NDArray[Any], channel: str) -> NDArray[Any]:
     return data[..., ("red", "green", "blue").index(channel)]
 
 
-def _size(kind: str, head: bytes) -> int | None:
-    """Return the number of pixels declared in the header of a map's file; None if it declares none.
+def _refuse_size(path: Path) -> None:
+    """Check the size that a header declares, because a reader allocates it all before it notices a short file."""
+    kind, source = path.suffix.lower(), str(path)
+    with opened(path) as file:
+        head, most = file.read(_HEADER_BYTES), _FEW_VALUES + _MOST_PER_BYTE * os.fstat(file.fileno()).st_size
+    size, channels = _size(kind, head), _channels(head)
+    if size == 0 or (size is None and kind == ".pfm"):  # Mitsuba would divide by zero
+        raise InputError("is not a readable map (its header names no size)", source=source)
+    if size is not None and size > MAX_MAP_PIXELS:
+        raise InputError(f"has {size} pixels; at most {MAX_MAP_PIXELS}", source=source)
+    if size is not None and size * channels > most:
+        raise InputError(f"has {size} pixels of {channels} channels in too few bytes", source=source)
 
-    The reader allocates all of them before it notices that the file is too short.
-    """
+
+def _decoded(path: Path) -> NDArray[Any]:
+    """Read the pixels of a file (h, w) or (h, w, channels)."""
+    if path.suffix.lower() == ".npy":
+        with opened(path) as file:
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    stream = mi.MemoryStream()
+    stream.write(read_bytes(path))
+    stream.seek(0)
+    with second_thread():
+        bitmap = mi.Bitmap(stream)
+    return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+
+
+def _size(kind: str, head: bytes) -> int | None:
+    """Return the number of pixels declared in the header of a map's file; None if it declares none."""
     if kind == ".npy":
         shape = re.search(rb"'shape': *\(([0-9, ]{1,99})\)", head)
         return math.prod(int(n) for n in re.findall(rb"[0-9]+", shape[1])) if shape else None
@@ -136,6 +153,12 @@ def _size(kind: str, head: bytes) -> int | None:
         return max(int(x1 - x0) + 1, 0) * max(int(y1 - y0) + 1, 0)
     sides = re.search(_SIDES[kind], head)
     return int(sides[1]) * int(sides[2]) if sides else None
+
+
+def _channels(head: bytes) -> int:
+    """Return the number of channels that the header of an OpenEXR file lists, at most; 3 for other files."""
+    listed = re.search(rb"channels\0chlist\0(.{4})", head, re.DOTALL)
+    return 3 if listed is None else max(1, int.from_bytes(listed[1], "little") // _CHANNEL_BYTES)
 
 
 def environment_map(values: Floats) -> EnvironmentMap:
