@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +20,10 @@ from ..imaging.autoexposure import settled_exposure_ms
 from ..imaging.capture import BegunImage, EyeImage, begin_each, make_renderer, noiseless
 from ..imaging.labels import image_labels
 from ..rig.plausibility import is_saturated
+from ..scene import Scene
 from .plan import Plan
 from .realise import Realised, Rejection, realise, sample_line
+from .validation.problems import differences
 
 if TYPE_CHECKING:
     from ..rendering.renderer import Renderer
@@ -133,6 +135,8 @@ class Maker:
             return MadeSample(index, (), found.rejections)
         if [image.row for image in images] != list(range(len(found.frames))):
             raise InputError(f"must be {len(found.frames)}, one for each eye in each frame, in order", path="images")
+        for image in images:
+            _refuse_another(found.frames, image)
         return MadeSample(index, tuple(self._labelled(found, images)), found.rejections)
 
     def _labelled(self, found: Realised, images: Iterable[EyeImage]) -> Iterator[MadeImage]:
@@ -143,6 +147,25 @@ class Maker:
             kinds = self.plan.spec.labels.pictures
             pictures = {kind: _PICTURES[kind](image) for kind in kinds}
             yield MadeImage(name, pictures, line, is_saturated(image.counts, image.scene.spec.sensor))
+
+
+def _refuse_another(frames: Frames, image: EyeImage) -> None:
+    """Check that a picture is of one of the frames, whatever its counts are.
+
+    Raises:
+        InputError: it shows another scene, eye or frame.
+    """
+    mine, other = frames.scene, image.frame.scene
+    path = f"images.{image.row}"
+    if not isinstance(other, Scene):
+        raise InputError("must show a Scene", path=path)
+    a, b = ({**s.located().to_mapping(), "eye_file": s.eye_file("right").to_mapping()} for s in (mine, other))
+    change = next(chain(differences(a, b, 0.0), differences(b, a, 0.0)), None)
+    if change is not None:
+        raise InputError(f"shows another scene: {change}", path=path)
+    own = frames[image.row]
+    if own.index != image.frame.index or own.pose != image.frame.pose:
+        raise InputError("shows another frame", path=path)
 
 
 _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {

@@ -7,6 +7,7 @@ load a function: only the user's command or Python call does (`OwnScenes.of`), a
 from __future__ import annotations
 
 import inspect
+import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -160,8 +161,13 @@ def given_scene(scene: Any, draws: Mapping[str, Any], base: Path, *, source: str
     The seed 0 of a `Scene` or `SceneSpec` counts as none given, so that no two images share their noise.
 
     Raises:
-        InputError: it is something else, or its eye cannot be read.
+        InputError: it is something else, its eye cannot be read, or a draw is not finite.
     """
+    for name, value in draws.items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except (TypeError, ValueError):
+            raise InputError(f"must be finite, not {shown(value)}", source=source, path=f"draws.{name}") from None
     if isinstance(scene, Scene):
         spec, own = scene.located(), scene.base
         eye = {} if spec.person is not None else scene.eye_spec.to_mapping()

@@ -174,7 +174,8 @@ class DatasetWriter:
             split: the split; a subject must be in one split only.
             draws: numbers to store with the image, with the same keys in each sample.
             images: images of all frames of the scene, as `render` makes them, which are stored instead of rendering it.
-                Their `counts` may be changed; the labels remain those of the scene.
+                Their `counts` may be changed; the labels remain those of the scene, so pictures of another scene, eye
+                or frame are refused.
 
         Returns:
             The number of stored images: 0 where the sample was stored before, or where the scene cannot be rendered,

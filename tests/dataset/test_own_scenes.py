@@ -251,6 +251,21 @@ def test_a_writer_stores_images_that_the_user_made(tmp_path):
         cut = [dataclasses.replace(images[0], counts=images[0].counts[:4])]
         with pytest.raises(InputError, match="images: must have counts"):
             writer.add(1, scene, images=cut)
+        for change, words in (
+            ({"rig.lights.0.position_mm.1": 9.0}, "images.0: shows another scene: rig.lights.0"),
+            ({"eye.model": "E1"}, "images.0: shows another scene: eye.model"),
+            ({"targets.screen_mm.0.0": 3.0}, "images.0: shows another scene: targets"),
+        ):
+            others = er.render(scene.with_({**change, "image.spp": 1}), threads=1)
+            with pytest.raises(InputError, match=words):
+                writer.add(1, scene.with_({"image.spp": 1}), images=others)
+        turned = dataclasses.replace(images[0].frame.pose, azimuth_rad=[0.1])
+        frame = dataclasses.replace(images[0].frame, pose=turned)
+        with pytest.raises(InputError, match=r"images\.0: shows another frame"):
+            writer.add(1, scene, images=[dataclasses.replace(images[0], frame=frame)])
+        for value in (float("nan"), [1.0, float("inf")], object()):
+            with pytest.raises(InputError, match=r"draws\.power"):
+                writer.add(1, scene, images=images, draws={"power": value})
         assert writer.add(1, scene, images=images) == 1
     folder = er.ImageFolder.load(tmp_path / "out")
     np.testing.assert_array_equal(folder.entries[0].image(), images[0].counts // 2)
