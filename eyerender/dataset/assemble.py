@@ -76,6 +76,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         **more,
         "versions": run_versions(),
         "backends": sorted(statistics.backends),
+        "rounding": sorted(statistics.rounding),
         "conventions": CONVENTIONS,
         "statistics": found,
         "checksums": {name: sum_of(folder / name) for name in (table.layout.table, FAILURES)},
@@ -249,6 +250,7 @@ class Statistics:
 
     def __init__(self) -> None:
         self.backends: set[str] = set()
+        self.rounding: set[str] = set()  # fingerprints
         self.images = self.saturated = self.rejected = self.given_up = self.samples = self.bytes = 0
         self.splits: Counter[str] = Counter()
         self.subjects: dict[str, set[int]] = {}
@@ -260,6 +262,7 @@ class Statistics:
         """Count a shard from its done.json."""
         backend = done["backend"]
         self.backends.add(f"{backend['name']} ({backend['device']}; {done['cpu']})")
+        self.rounding.add(done.get("rounding") or "unknown")
         chosen = done.get("chosen")
         self.samples += done["samples"][1] - done["samples"][0] if chosen is None else len(chosen)
         self.images += done["images"]

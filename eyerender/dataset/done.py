@@ -102,6 +102,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
     "versions": lambda v: isinstance(v, Mapping),
     "backend": lambda v: isinstance(v, Mapping) and all(isinstance(v.get(key), str) for key in ("name", "device")),
     "cpu": lambda v: isinstance(v, str),
+    "rounding": lambda v: v is None or isinstance(v, str),  # earlier versions did not write it
     "rejections": lambda v: _are(v, lambda entry: isinstance(entry, Mapping)),
     "given_up": lambda v: _are(v, _is_count),
     "files": is_sums,

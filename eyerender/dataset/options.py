@@ -32,6 +32,7 @@ class RunOptions:
         threads: Total number of CPU threads (default: all).
         timeout_s: Seconds without a sign of life after which a worker is ended and its shard is retried.
         overwrite: Replace the contents of the folder.
+        same_bytes: Refuse shards that processes with another rounding made (docs/datasets.md), instead of a warning.
         repair: Compare finished shards with their checksums first, and make damaged ones again. Shards of pictures in
             files are always compared.
     """
@@ -44,6 +45,7 @@ class RunOptions:
     timeout_s: float = 600.0
     overwrite: bool = False
     repair: bool = False
+    same_bytes: bool = False
 
     def __post_init__(self) -> None:
         for name in ("workers", "threads"):

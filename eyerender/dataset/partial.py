@@ -44,6 +44,7 @@ from .done import FILES, PACKED, cpu_family, described, picture_file, read_done,
 from .maker import MadeSample
 from .packing import SHARD, pack, unpack
 from .plan import Plan
+from .rounding import rounding
 
 CHECKPOINT_S = 10.0
 """Time between checkpoints: the most work lost when a worker is killed."""
@@ -64,6 +65,7 @@ class PartialShard:
         self._start = self._checkpoint = self._last = time.monotonic()  # of worker, checkpoint and sample
         self._before = 0.0  # seconds of earlier workers
         self._made_by = {"digest": plan.digest, "versions": run_versions(), "backend": backend, "cpu": cpu_family()}
+        self._made_by["rounding"] = rounding()
         self._rejections: list[dict[str, Any]] = []
         self._given_up: list[int] = []
         self._saturated: list[int] = []  # the sample of each saturated image

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -27,11 +27,13 @@ from .partial import checkpoints, set_aside
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .realise import frames_of
+from .rounding import by_rounding, rounding
 from .runfile import begin, refuse_another_count, refuse_taken, settle, was_resized
 from .selection import in_spread_order
 from .shard import Staged, commit, fits, is_finished, remove_leftovers, withdraw_damaged
 from .spec import DatasetSpec
 from .status import Log
+from .validation.problems import SHOWN
 from .worker import Job
 
 if TYPE_CHECKING:
@@ -243,6 +245,8 @@ class Run:
                 self.repaired(f"the dataset is assembled again: {problem}")
         self.intact = not self.todo and problem is None and not self._verifies
         self.counts.total = sum(map(self.plan.spec.selection.shard_count, self.todo))
+        if self.options.same_bytes:
+            self._compare_rounding(sorted(done & set(self.plan.spec.shards)), rounding())
         if self.todo:
             remove_file(self.folder / DATASET)  # a folder that has one is complete
             for shard in sorted(done) if self._verifies else ():
@@ -315,9 +319,24 @@ class Run:
                 remove_file(self.folder / DATASET)
                 return missing, None
             refuse_another_count(self.folder, self.plan)
+            self._compare_rounding(self.plan.spec.shards)
             found = assemble(self.plan, self.folder)
             settle(self.folder, self.plan)
             return missing, found
+
+    def _compare_rounding(self, shards: Iterable[int], mine: str | None = None) -> None:
+        """Warn if finished shards, or this process (`mine`), round differently; with `same_bytes`, refuse."""
+        groups = by_rounding(self.folder, shards)
+        usual = mine or max(groups, key=lambda key: len(groups[key]), default="")
+        others = sorted(shard for key, own in groups.items() if key != usual for shard in own)
+        if not others:
+            return
+        names = ", ".join(map(str, others[:SHOWN])) + (f" and {len(others) - SHOWN} more" if others[SHOWN:] else "")
+        text = f"another rounding made the shards {names}, so single pixels may differ"
+        if self.options.same_bytes:
+            raise InputError(f"{text} (--same-bytes)", source=str(self.folder))
+        self.say(f"warning: {text}")
+        self.log.write("warning", reason="mixed rounding", shards=others[:SHOWN])
 
     @property
     def _verifies(self) -> bool:

@@ -21,6 +21,7 @@ from .croissant import CROISSANT
 from .done import FILES, PACKED, read_done, run_versions
 from .environment import environment
 from .plan import Plan
+from .rounding import rounding
 from .spec import DatasetSpec
 
 MAX_SHARDS, MAX_CHOICES = 1_000_000, 100_000_000
@@ -114,7 +115,7 @@ def refuse_another_count(folder: Path, plan: Plan) -> None:
 
 def _content(plan: Plan) -> dict[str, Any]:
     """Return the content of run.json."""
-    made_with = {"versions": run_versions(), "environment": environment()}
+    made_with = {"versions": run_versions(), "environment": environment(), "rounding": rounding()}
     layout = PACKED if plan.spec.is_packed else FILES
     return {"schema": layout.run, "digest": plan.digest, **plan.to_mapping(), **made_with}
 
@@ -138,7 +139,7 @@ def _count_of(run: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def _of_any_count(run: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the content of run.json without the number of samples and without entries that affect no byte."""
-    run = {key: value for key, value in run.items() if key not in ("resized", "environment")}
+    run = {key: value for key, value in run.items() if key not in ("resized", "environment", "rounding")}
     spec = run.get("spec")
     if not isinstance(spec, Mapping):
         return run

@@ -29,7 +29,7 @@ from ..optics.interface import dot
 from ..optics.solve import apparent_points
 from ..optics.surfaces import Xyz, components, join
 from ..optics.trace import trace
-from ..optics.transforms import normalize
+from ..optics.transforms import inverse_2x2, normalize
 from .batch import CHUNK_POINTS, chunks, groups
 from .landmarks import path_to_retina
 from .model import EyeModel
@@ -179,7 +179,7 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
             break
         sound = np.abs(np.linalg.det(slope)) > 1e-12
         safe = np.where(sound[:, None, None], slope, np.eye(2))
-        step = -np.linalg.solve(safe, np.where(sound[:, None], miss, 0.0)[..., None])[..., 0]
+        step = -np.einsum("nij,nj->ni", inverse_2x2(safe), np.where(sound[:, None], miss, 0.0))
         step = np.clip(step, -0.2, 0.2)
         angles = angles + step
         new, entry, way, lost = _window_miss(eye, target_mm, angles)

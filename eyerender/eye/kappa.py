@@ -15,7 +15,7 @@ from ..base.errors import InputError
 from ..base.status import Status
 from ..optics.solve import ApparentPoints, apparent_points
 from ..optics.trace import trace
-from ..optics.transforms import normalize
+from ..optics.transforms import inverse_2x2, normalize
 from .landmarks import field_direction, fovea_by_nodal_ray, incident_node, path_to_retina
 from .model import EyeModel
 from .parts import FoveaSpec
@@ -123,7 +123,7 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
             horizontal, vertical = np.degrees(field)
             return float(_handed(eye) * horizontal), float(vertical)
         slope = np.column_stack([(miss(field + _STEP_RAD * unit) - error) / _STEP_RAD for unit in np.eye(2)])
-        field = field - np.linalg.solve(slope, error)
+        field = field - inverse_2x2(slope) @ error
     raise InputError("no nodal ray ends there", path="fovea")
 
 

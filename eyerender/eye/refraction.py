@@ -12,7 +12,7 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.status import Status
 from ..optics.trace import trace
-from ..optics.transforms import normalize
+from ..optics.transforms import inverse_2x2, normalize
 from .landmarks import path_to_retina
 from .model import EyeModel
 
@@ -50,7 +50,7 @@ def refraction_d(eye: EyeModel, *, vertex_mm: float = VERTEX_MM) -> tuple[float,
     retina = traced.points_mm[-1, :, 1:]
     change = (retina[:4] - retina[4:]).T
     a, b = change[:, :2] / (2 * _HEIGHT_MM), change[:, 2:] / (2 * _SLOPE)
-    vergence = np.linalg.solve(b, a)
-    power = 1000.0 * vergence @ np.linalg.inv(np.eye(2) + vertex_mm * vergence)
+    vergence = inverse_2x2(b) @ a
+    power = 1000.0 * vergence @ inverse_2x2(np.eye(2) + vertex_mm * vergence)
     mean, first = (power[0, 0] + power[1, 1]) / 2, (power[0, 0] - power[1, 1]) / 2
     return float(mean), float(first), float((power[0, 1] + power[1, 0]) / 2)

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.status import Status
 from .trace import Crossing, Traced, trace
-from .transforms import normalize
+from .transforms import inverse_2x2, normalize
 
 _STEP = 1e-5
 _PARALLEL = 1e-13
@@ -51,7 +51,7 @@ def _solved(path: Sequence[Crossing], objects_mm: Floats, direction: Floats) -> 
         slope = np.stack([(error[1] - error[0]) / _STEP, (error[2] - error[0]) / _STEP], axis=-1)
         singular = ~ok | ~(np.abs(np.linalg.det(slope)) > 1e-12)
         slope = np.where(singular[:, None, None], np.eye(2), slope)
-        step = np.linalg.solve(slope, np.where(singular[:, None], 0.0, error[0])[..., None])[..., 0]
+        step = np.einsum("nij,nj->ni", inverse_2x2(slope), np.where(singular[:, None], 0.0, error[0]))
         if np.max(np.abs(step)) < 1e-16:
             break
         direction = normalize(direction - step[..., :1] * first - step[..., 1:] * second)

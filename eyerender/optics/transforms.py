@@ -72,6 +72,16 @@ def normalize(vectors: npt.ArrayLike) -> Floats:
     return unit
 
 
+def inverse_2x2(matrices: npt.ArrayLike) -> Floats:
+    """Invert matrices (..., 2, 2) in closed form, because the rounding of LAPACK depends on the processor.
+
+    The inverse of a singular matrix holds infinities or NaN.
+    """
+    (a, b), (c, d) = np.moveaxis(np.asarray(matrices, dtype=np.float64), (-2, -1), (0, 1))
+    adjugate: Floats = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
+    return adjugate / (a * d - b * c)[..., None, None]
+
+
 def direction_of(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Floats:
     """Compute unit vectors (..., 3) at azimuths and elevations: (cos el cos az, cos el sin az, sin el)."""
     cos_elevation = np.cos(elevation_rad)

@@ -14,6 +14,7 @@ from ...base.storage.files import shown
 from ...folders.imagefolder import ARRAY_KEYS, KINDS, ImageEntry, ImageFolder
 from ..done import cpu_family, read_done, run_versions
 from ..maker import Maker
+from ..rounding import rounding
 from .problems import FolderProblems
 from .truth import DatasetTruth
 
@@ -91,6 +92,12 @@ def other_maker(folder: ImageFolder, truth: DatasetTruth, entry: ImageEntry, bac
     """Describe how the maker of an image differs from this process; empty if nothing affects its bytes."""
     done = read_done(folder.path, truth.plan.spec.selection.shard_of(int(entry.line["sample"])))
     old = {**done["versions"], **{k: v for k, v in done["backend"].items() if k != "threads"}, "cpu": done["cpu"]}
-    new = {**run_versions(), **{k: v for k, v in backend.items() if k != "threads"}, "cpu": cpu_family()}
+    old["rounding"] = done.get("rounding")
+    new = {
+        **run_versions(),
+        **{k: v for k, v in backend.items() if k != "threads"},
+        "cpu": cpu_family(),
+        "rounding": rounding(),
+    }
     other = [key for key in old if key != "python" and old[key] != new.get(key)]
     return ", ".join(f"{key} is {shown(new.get(key))}, was {shown(old[key])}" for key in other)

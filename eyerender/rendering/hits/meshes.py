@@ -26,7 +26,7 @@ from ...eye.meshes import Patch, cornea_patches
 from ...eye.model import EyeModel
 from ...optics.formulas import NUMPY
 from ...optics.surfaces import Surface, components, join
-from ...optics.transforms import normalize
+from ...optics.transforms import inverse_2x2, normalize
 from ..records.frame import aligned_copy, upload_array
 from ..records.surfaces import Bundle, DeviceSurface, NormalForm
 
@@ -148,7 +148,7 @@ class SurfaceMesh:
             determinant = np.linalg.det(jacobian)
             found &= np.abs(determinant) > _SETTLED
             jacobian[~found] = np.eye(2)
-            step = np.linalg.solve(jacobian, miss[..., None])[..., 0]
+            step = np.einsum("nij,nj->ni", inverse_2x2(jacobian), miss)
             q = np.where(found[:, None], q - step, q)
             if not found.any() or np.max(np.abs(step[found])) < _SETTLED:
                 break
@@ -178,7 +178,7 @@ class SurfaceMesh:
         corners = self.faces[np.where(there, face.numpy(), 0)]
         p, n = self.vertices[corners], self.normals[corners]
         edges = np.swapaxes(p[:, 1:] - p[:, :1], 1, 2)  # (n, 3, 2)
-        inverse = np.linalg.inv(edges[:, 1:])  # steps in (y, z) to barycentric coordinates
+        inverse = inverse_2x2(edges[:, 1:])  # steps in (y, z) to barycentric coordinates
         uv = np.einsum("nij,nj->ni", inverse, q - p[:, 0, 1:])
         turns = np.swapaxes(n[:, 1:] - n[:, :1], 1, 2)
         point = p[:, 0] + np.einsum("nij,nj->ni", edges, uv)
