@@ -19,11 +19,20 @@ from .done import read_done
 def rounding() -> str:
     """Compute a fingerprint of rounding: 16 hexadecimal digits of the SHA-256 of the results of a small computation.
 
-    It multiplies and factorises small matrices, evaluates functions of NumPy, and traces two frames of an eye. Processes
-    that agree in it may still render single pixels differently, where Embree rounds a silhouette.
+    It multiplies and factorises small matrices, evaluates functions of NumPy, and traces two frames of an eye.
+    Processes that agree in it may still render single pixels differently, where Embree rounds a silhouette.
     """
     a, b = np.random.default_rng(0).standard_normal((2, 24, 24))
-    found = [a @ b, a[:3, :3] @ b[:3, 0], np.linalg.solve(a, b), np.linalg.eigvalsh(a + a.T), np.sin(9 * a), np.exp(b)]
+    single = np.random.default_rng(0).standard_normal((40, 200), dtype=np.float32)
+    found = [
+        single @ single.T,
+        a @ b,
+        a[:3, :3] @ b[:3, 0],
+        np.linalg.solve(a, b),
+        np.linalg.eigvalsh(a + a.T),
+        np.sin(9 * a),
+        np.exp(b),
+    ]
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(values).tobytes() for values in found))
     eyes = trace(load_scene("guestrin2006").frames()[:2], boundary_points=24)
     digest.update(json.dumps(list(eyes.records())).encode())

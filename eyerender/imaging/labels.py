@@ -22,6 +22,7 @@ from ..eye.entrance import entrance_pupil_mm
 from ..eye.fixation import fixations
 from ..eye.model import EyeModel
 from ..optics.ellipse import fit_ellipse_direct
+from ..optics.transforms import rotated
 from ..region.limbus import lower
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..scene.observation import EYES, Observations
@@ -214,7 +215,7 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     y, z = lower(surface, rho * np.cos(angle), rho * np.sin(angle), scene.spec.look.limbus_aspect)
     local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
     points = surface.origin_mm + local @ np.asarray(surface.rotation).T
-    eyepoint = view.M.T @ (camera.nodal_point_mm - view.t)
+    eyepoint = rotated(view.M.T, camera.nodal_point_mm - view.t)
     facing = np.sum(surface.normal(points) * (eyepoint - points), axis=-1) > 0
     pixels, front = camera.project(points @ view.M.T + view.t)
     reason = None
@@ -316,16 +317,16 @@ def _space(
         for name in ("azimuth_centre_mm", "elevation_centre_mm")
     }
     world = {k: p + index.head_mm[row] for k, p in head.items()}
-    world |= {k: M @ np.asarray(p) + t for k, p in points.items()} | {k: M @ d for k, d in directions.items()}
+    world |= {k: rotated(M, p) + t for k, p in points.items()} | {k: rotated(M, d) for k, d in directions.items()}
     axes, offset = camera.sensor_axes, camera.sensor_offset  # x to the right in the image, also behind a mirror
-    seen = {k: axes @ v + (0.0 if k in directions else offset) for k, v in world.items()}
+    seen = {k: rotated(axes, v) + (0.0 if k in directions else offset) for k, v in world.items()}
     target = index.target_mm[row]
     there = bool(np.isfinite(target).all())
     return {
         "head": {k: v.tolist() for k, v in head.items()},
         "world": {k: v.tolist() for k, v in world.items()} | {"target_mm": target.tolist() if there else None},
         "camera": {k: v.tolist() for k, v in seen.items()}
-        | {"target_mm": (axes @ target + offset).tolist() if there else None},
+        | {"target_mm": (rotated(axes, target) + offset).tolist() if there else None},
     }
 
 

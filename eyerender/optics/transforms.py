@@ -72,6 +72,12 @@ def normalize(vectors: npt.ArrayLike) -> Floats:
     return unit
 
 
+def rotated(rotation: npt.ArrayLike, vectors: npt.ArrayLike) -> Floats:
+    """Multiply a matrix (3, 3) by vectors (..., 3) without BLAS, whose rounding depends on the processor."""
+    out: Floats = np.einsum("ij,...j->...i", np.asarray(rotation, np.float64), np.asarray(vectors, np.float64))
+    return out
+
+
 def inverse_2x2(matrices: npt.ArrayLike) -> Floats:
     """Invert matrices (..., 2, 2) in closed form, because the rounding of LAPACK depends on the processor.
 

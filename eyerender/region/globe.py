@@ -16,6 +16,7 @@ import numpy as np
 
 from ..base.arrays import ArrayValue, Floats, frozen, remembered, sealed
 from ..optics.surfaces import Surface, components
+from ..optics.transforms import rotated
 from ..optics.vectors import lengths
 
 _POLAR, _TURNS = 241, 96
@@ -145,7 +146,7 @@ def _posed(globe: Globe) -> _Posed:
     bulge = np.zeros((_POLAR, _TURNS + 1))
     if globe.cornea is not None:
         bulge = _table(globe.cornea, globe.limbus_radius_mm, tuple(globe.centre_mm.tolist()), globe.radius_mm)
-    centre = globe.mirror * (globe.M @ globe.centre_mm + globe.t)
+    centre = globe.mirror * (rotated(globe.M, globe.centre_mm) + globe.t)
     return _Posed(sealed(centre), globe.mirror[:, None] * globe.M, bulge, float(np.max(bulge)))
 
 

@@ -26,6 +26,7 @@ from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.errors import InputError
 from ..base.spec import Number, Positive, Side, Spec, Vec2, Vec3
 from ..base.storage.files import shown
+from ..optics.transforms import rotated
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
@@ -301,7 +302,7 @@ class Camera(Spec):
         turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1.0]])
         R = (axes @ turn).T
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        return PinholeCamera.of(K, R, -R @ position, self.resolution_px, self.distortion, self.name)
+        return PinholeCamera.of(K, R, -rotated(R, position), self.resolution_px, self.distortion, self.name)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -354,7 +355,7 @@ class PinholeCamera(ArrayValue):
             raise InputError("lies in the plane of its mirror", path=f"camera {self.name!r}")
         reflect = np.eye(3) - 2.0 * np.outer(normal, normal)
         flip = np.array([-1.0, 1.0, 1.0])
-        t = self.R @ (2.0 * offset * normal) + self.t
+        t = rotated(self.R, 2.0 * offset * normal) + self.t
         return replace(
             self, R=frozen(flip[:, None] * (self.R @ reflect)), t=frozen(flip * t), mirrored=not self.mirrored
         )
@@ -381,7 +382,7 @@ class PinholeCamera(ArrayValue):
     @property
     def nodal_point_mm(self) -> Floats:
         """Centre of projection in the world, (3,) mm: -R^T t."""
-        return np.asarray(-self.R.T @ self.t)
+        return np.asarray(-rotated(self.R.T, self.t))
 
     @property
     def axis(self) -> Floats:

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from ..base.arrays import Floats, frozen
 from ..base.spec import Spec, Vec3
+from ..optics.transforms import rotated
 from .camera import PinholeCamera
 from .light import Lamp
 
@@ -32,17 +33,19 @@ class Mount(Spec):
             turn[j, i], turn[i, j] = np.sin(angle), -np.sin(angle)
             rotation = turn @ rotation
         centre = np.array(self.about_mm, dtype=float)
-        return rotation, centre - rotation @ centre + np.array(self.translation_mm, dtype=float)
+        return rotation, centre - rotated(rotation, centre) + np.array(self.translation_mm, dtype=float)
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
         """Move a camera, so that a moved world point has the same camera coordinates as before."""
         rotation, offset = self._motion()
         turned = camera.R @ rotation.T
-        return replace(camera, R=frozen(turned), t=frozen(camera.t - turned @ offset))
+        return replace(camera, R=frozen(turned), t=frozen(camera.t - rotated(turned, offset)))
 
     def lamp(self, lamp: Lamp) -> Lamp:
         """Move a light and turn its axis."""
         rotation, offset = self._motion()
         return replace(
-            lamp, position_mm=frozen(rotation @ lamp.position_mm + offset), axis=frozen(rotation @ lamp.axis)
+            lamp,
+            position_mm=frozen(rotated(rotation, lamp.position_mm) + offset),
+            axis=frozen(rotated(rotation, lamp.axis)),
         )

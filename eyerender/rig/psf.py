@@ -91,7 +91,8 @@ def splat(
         return np.zeros((0, 0)), slice(0, 0), slice(0, 0)
     gx = _integrals(x0 + columns.start, columns.stop - columns.start, xy_px[:, 0], sigma_px)
     gy = _integrals(y0 + rows.start, rows.stop - rows.start, xy_px[:, 1], sigma_px)
-    return np.asarray(gy.T @ (gx * energy[:, None])), rows, columns
+    # Not by BLAS, whose rounding depends on the processor.
+    return np.einsum("ni,nj->ij", gy, gx * energy[:, None]), rows, columns
 
 
 def _spread(

@@ -32,7 +32,7 @@ from ...optics.shooting import ray_tube
 from ...optics.solve import mirrored_rays
 from ...optics.surfaces import Surface, components, join
 from ...optics.trace import Crossing
-from ...optics.transforms import normalize
+from ...optics.transforms import normalize, rotated
 from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
 from ..hits.meshes import MirrorPoints, SurfaceMesh
@@ -238,7 +238,7 @@ class GlintScene:
     @property
     def eyepoint(self) -> Floats:
         """The camera's nodal point in the eye frame."""
-        return np.asarray(self.M.T @ (self.camera.nodal_point_mm - self.t))
+        return rotated(self.M.T, self.camera.nodal_point_mm - self.t)
 
     def _clear(self, clear: Visibility, sources: Floats, entries: Floats, exits: Floats) -> Bools:
         """Return whether the scene leaves the ways lamp to eye and eye to camera free, (k,)."""
@@ -406,7 +406,7 @@ def glint_table(glints: Sequence[Glint]) -> GlintTable:
     place, share = [], []
     for glint in glints:
         xy, energy, whole = glint.spots.xy_px, glint.spots.energy, glint.image.energy.sum()
-        place.append(energy @ xy / energy.sum() if len(energy) else np.full(2, np.nan))
+        place.append(np.sum(energy[:, None] * xy, axis=0) / energy.sum() if len(energy) else np.full(2, np.nan))
         seen = energy.sum() / whole if whole > 0 else 0.0
         share.append(seen if seen < 1 - 1e-9 else 1.0)
     energies = np.array([g.spots.energy.sum() for g in glints])

@@ -19,6 +19,7 @@ from ...base.arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, f
 from ...optics.interface import dot
 from ...optics.surfaces import Surface, Xyz
 from ...optics.surfaces_quadric import Quadric
+from ...optics.transforms import rotated
 from ...region.mesh import sheet_codes
 from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
@@ -283,4 +284,4 @@ def _rays(job: RenderJob, axes: Floats, rows: Indices | None = None) -> _Rays:
     x = (u - camera.K[0, 2]) / camera.K[0, 0]
     y = (v - camera.K[1, 2]) / camera.K[1, 1]
     one, two, three = ((x * axes[0, k] + (y * axes[1, k] + axes[2, k])).ravel() for k in range(3))
-    return _Rays(job.M.T @ (camera.nodal_point_mm - job.t), (one, two, three))
+    return _Rays(rotated(job.M.T, camera.nodal_point_mm - job.t), (one, two, three))

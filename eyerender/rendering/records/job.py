@@ -18,6 +18,7 @@ from ...optics.surfaces import Surface
 from ...optics.surfaces_biconic import Biconic
 from ...optics.surfaces_measured import Measured
 from ...optics.surfaces_quadric import Quadric
+from ...optics.transforms import rotated
 from ...region.anatomy import Region
 from ...region.globe import Globe
 from ...region.limbus import upwards
@@ -103,7 +104,7 @@ class RenderJob(ArrayValue):
         """Origin of the scene's frame in the world: the apex of the unrotated eye, (3,) mm."""
         if self.apex_mm is not None:
             return np.asarray(self.apex_mm, dtype=float)
-        return np.asarray(self.M @ _GLOBE_CENTRE_MM + self.t - _GLOBE_CENTRE_MM)
+        return np.asarray(rotated(self.M, _GLOBE_CENTRE_MM) + self.t - _GLOBE_CENTRE_MM)
 
     @property
     def globe(self) -> Globe:
@@ -331,7 +332,7 @@ class LampTable(ArrayValue):
     def of(cls, lights: Sequence[Lamp], M: Floats, t: Floats, suns: int = 0) -> LampTable:
         """Create the table from lamps in the world for an eye at x_world = M x + t."""
         rows = [
-            [*(M.T @ (lamp.position_mm - t)), *(M.T @ lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
+            [*rotated(M.T, lamp.position_mm - t), *rotated(M.T, lamp.axis), lamp.radius_mm, lamp.intensity_mw_sr,
              lamp.lobe_exponent, lamp.inner_radius_mm]
             for lamp in lights
         ]  # fmt: skip
@@ -377,7 +378,7 @@ def returned_light(job: RenderJob) -> FundusLight:
         disc_gain=fundus.disc_gain,
     )
     lamps = LampTable.of(job.lights, job.M, job.t).rows[:, :3]
-    return fundus_light(job.eye, lamps, job.M.T @ (job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
+    return fundus_light(job.eye, lamps, rotated(job.M.T, job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
 
 
 def _shape(surface: Surface, limbus_mm: float) -> Floats:

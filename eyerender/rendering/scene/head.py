@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...base.arrays import Floats
 from ...base.errors import InputError
+from ...optics.transforms import rotated
 from ...region.anatomy import Region
 from ...region.globe import Globe
 from ...region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
@@ -85,7 +86,7 @@ def cornea_depth_mm(place: RegionScene, globe: Globe) -> Floats:
     y, z = (rho * np.cos(turn)).ravel(), (rho * np.sin(turn)).ravel()
     local = np.stack([np.broadcast_to(surface.sag(y, z), y.shape), y, z], axis=-1)
     points = (surface.origin_mm + local @ np.asarray(surface.rotation).T) @ globe.M.T + globe.t
-    out = points - (globe.M @ globe.centre_mm + globe.t)
+    out = points - (rotated(globe.M, globe.centre_mm) + globe.t)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     table = np.column_stack([points - _DEPTH_MM * out, out]).astype(np.float32)
     # The values are gathered from one buffer, otherwise the kernel would depend on the alignment of every NumPy array.

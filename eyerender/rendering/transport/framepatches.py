@@ -16,6 +16,7 @@ import numpy as np
 
 from ...base.arrays import Cache, Floats, Ints
 from ...eye.model import EyeModel
+from ...optics.transforms import rotated
 from ...optics.vectors import dots, lengths
 from ...region.globe import Globe
 from ...region.look import Look
@@ -207,7 +208,7 @@ class FramePatches:
         job = self.job
         if self.plan.skin is None or not job.interreflection:
             return np.zeros(0, int)
-        bulge = job.M @ (np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
+        bulge = rotated(job.M, np.asarray(job.eye.front[0].origin_mm) - [CORNEA_MM, 0, 0]) + (job.t - job.anchor_mm)
         way = bulge - self.points
         return np.flatnonzero((lengths(way) < _CLOSE_MM) & (dots(way, self.normals) > -0.5 * CORNEA_MM))
 
