@@ -85,7 +85,8 @@ def inverse_2x2(matrices: npt.ArrayLike) -> Floats:
     """
     (a, b), (c, d) = np.moveaxis(np.asarray(matrices, dtype=np.float64), (-2, -1), (0, 1))
     adjugate: Floats = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
-    return adjugate / (a * d - b * c)[..., None, None]
+    inverse: Floats = adjugate / (a * d - b * c)[..., None, None]
+    return inverse
 
 
 def direction_of(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) -> Floats:

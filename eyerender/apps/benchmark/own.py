@@ -124,9 +124,9 @@ def _share(cell: str | None, source: str, where: str) -> float | None:
     return share
 
 
-def _ellipse(cells: list[str | None], source: str, where: str) -> Ellipse:
+def _ellipse(cells: list[str], source: str, where: str) -> Ellipse:
     try:
-        x, y, a, b, degrees = (float(cell or "") for cell in cells)
+        x, y, a, b, degrees = (float(cell) for cell in cells)
     except ValueError:
         raise InputError("needs five numbers, or none", source=source, path=where) from None
     if not (math.isfinite(x + y + a + b + degrees) and 0.0 < b <= a and max(abs(x), abs(y), a) < 1e5):

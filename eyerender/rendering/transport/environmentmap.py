@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ...base.arrays import ArrayValue, Floats, frozen
 from ...base.errors import InputError
 from ...base.spec import file_digest
-from ...base.storage.files import opened, read_bytes
+from ...base.storage.files import opened
 from ...rig.imaging import RadianceMap
 from ...rig.surroundings import paint
 from ..scene.exr import second_thread
@@ -134,11 +134,8 @@ def _decoded(path: Path) -> NDArray[Any]:
     if path.suffix.lower() == ".npy":
         with opened(path) as file:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-    stream = mi.MemoryStream()
-    stream.write(read_bytes(path))
-    stream.seek(0)
     with second_thread():
-        bitmap = mi.Bitmap(stream)
+        bitmap = mi.Bitmap(str(path))  # from a stream in memory, a damaged EXR file would be read for ever
     return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
 
 
