@@ -49,7 +49,7 @@ EXCEPTIONS = {
     "eye.topography._mesh: trimesh.load": "bytes that were read",
     "population.synteyes._arrays: np.load": "bytes that were read",
     "population.synteyes._arrays: zipfile.ZipFile": "bytes that were read",
-    "rendering.transport.environmentmap._decoded: mi.Bitmap": "Mitsuba opens by name; `_refuse_size` has checked the file",
+    "rendering.transport.environmentmap._decoded: mi.Bitmap": "by name; `_refuse_size` has checked it",
     "rendering.transport.environmentmap._decoded: np.lib.format.read_array": "an opened file",
     "rendering.scene.exr.write_exr: mi.Bitmap": "an array",
     "folders.video._capture: cv2.VideoCapture": "FFmpeg opens by name; `VideoReader` has checked the file",

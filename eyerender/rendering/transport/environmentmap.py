@@ -15,6 +15,7 @@ import math
 import os
 import re
 import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,7 +133,7 @@ def _refuse_size(path: Path) -> None:
 def _decoded(path: Path) -> NDArray[Any]:
     """Read the pixels of a file (h, w) or (h, w, channels)."""
     if path.suffix.lower() == ".npy":
-        with opened(path) as file:
+        with opened(path) as file, warnings.catch_warnings(action="ignore"):
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
     with second_thread():
         bitmap = mi.Bitmap(str(path))  # from a stream in memory, a damaged EXR file would be read for ever
