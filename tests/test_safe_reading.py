@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import os
+import subprocess
+import sys
 import warnings
 
 import pytest
@@ -13,6 +15,7 @@ from eyerender.base.spec import parse_yaml
 from eyerender.base.storage.files import appended, parse_json, read_table
 from eyerender.cli.output import progress, say
 from eyerender.report.style import figure, log_scale, svg
+from tests.support.paths import ROOT
 from tests.support.readings import OPENERS, calls, other_ways
 
 # Other calls that open something, and why they may.
@@ -33,6 +36,7 @@ EXCEPTIONS = {
     "apps.live.page.Tab.wake: self._studio.painter.open": "no file",
     "cli.live.live.announce: webbrowser.open": "no file",
     "cli.main.run: os.open": "the null device",
+    "cli.main._fill_closed_streams: os.open": "the null device",
     "dataset.cluster.drive: os.open": "the null device",
     "dataset.cluster._members: (place / 'stat').read_text": "the kernel's /proc",
     "backends.choose._cuda_driver: Path('/proc/driver/nvidia/version').read_text": "the kernel's /proc",
@@ -80,6 +84,13 @@ def test_no_link_is_followed_to_a_file_of_a_fixed_name_in_a_folder():
         if joined and ast.unparse(call.func) in OPENERS - {"mapped_array", "JsonLines.index"}:
             found += [name] if all(keyword.arg != "follow" for keyword in call.keywords) else []
     assert found == []
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_no_error(closed):
+    command = ["sh", "-c", f"{sys.executable} -P -m eyerender eyes {closed}"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_only_these_functions_print():

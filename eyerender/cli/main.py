@@ -58,6 +58,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in tokens
     cached = "--no-cache" not in tokens
     tokens = [t for t in tokens if t not in ("--debug", "--no-cache")]
+    _fill_closed_streams()
     previous = _terminate_like_interrupt()
     try:
         with nullcontext() if cached else _without_cache(), _one_line_warnings():
@@ -77,6 +78,16 @@ def run(argv: Sequence[str] | None = None) -> int:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _fill_closed_streams() -> None:
+    """Open the null device for standard streams that are closed, so that no other file takes their numbers."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
 def _called(tokens: Sequence[str]) -> Any:
