@@ -112,7 +112,8 @@ def _topography_ply_seeds() -> list[bytes]:
     x, y = (side.ravel() for side in np.meshgrid(at, at))
     points = np.stack([x, y, 7.8 - np.sqrt(7.8**2 - x * x - y * y)], axis=1)
     mesh = trimesh.Trimesh(points, Delaunay(points[:, :2]).simplices, process=False)
-    return [bytes(mesh.export(file_type="ply"))]
+    data: Any = mesh.export(file_type="ply")
+    return [data]
 
 
 def _topography_names(path: Path) -> Any:
@@ -205,7 +206,7 @@ def _rate(path: Path) -> Any:
     from eyerender.dataset import estimate
 
     with mock.patch.object(estimate, "_path", mock.Mock(return_value=path)):
-        return estimate.last_rate(None, "llvm")  # type: ignore[arg-type]
+        return estimate.last_rate(mock.Mock(), "llvm")
 
 
 RATE = {"how": "run", "time": "2026-01-01T00:00:00Z", "backend": "llvm", "samples": 3, "start_seconds": 1.0}

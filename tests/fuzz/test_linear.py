@@ -23,7 +23,17 @@ TEXTS = {
     "data.json": ["[", '{"a":', '"\\u0000', "1", "-", "1e", " "],
     "records.csv": ["a,", "a\n", '"', '"a""b', ";", "pupil_x_px_", "-mm", "pupil_x,pupil_y\n1,"],
     "records.jsonl": ["{}\n", "["],
-    "head.obj": ["v 0 0 0\n", "f 1 1 1\n", "f 1//", "o a\n", "g a\n", "\\\n", "v 1 ", "usemtl a\n"],
+    "head.obj": [
+        "v 0 0 0\n",
+        "f 1 1 1\n",
+        "f 1//",
+        "o a\n",
+        "g a\n",
+        "\\\n",
+        "v 1 ",
+        "usemtl a\n",
+        "usemtl a\nf 1 1 1\n",
+    ],
     "head.stl": ["solid a\n", "facet normal 0 0 1\n", "vertex 0 0 0\n", "endfacet\n", "\n", "a "],
     "head.ply": ["ply\n", "ply\ncomment ", "ply\nelement vertex 1\n", "ply\nproperty float x\n"],
 }
