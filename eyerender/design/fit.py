@@ -180,6 +180,9 @@ class EyeFit(ArrayValue):
         }
 
 
+_FARTHEST_PX = 1e6  # the largest sensor has 65,536 columns
+
+
 def fit_eye(
     observations: Observations,
     rig: RigLike,
@@ -209,8 +212,13 @@ def fit_eye(
         start: (i, 23) start of the unknowns, for one eye; default: a search.
 
     Raises:
-        InputError: there is nothing to fit, or an eye has no position.
+        InputError: there is nothing to fit, an eye has no position, or a feature lies a million pixels away.
     """
+    pupils, glints = observations.pupil.centre_px, observations.glints.xy_px
+    far = (np.abs(pupils) > _FARTHEST_PX).any(axis=-1) | (np.abs(glints) > _FARTHEST_PX).any(axis=(-2, -1))
+    if far.any():
+        frame = int(observations.index.frame[far.argmax()])
+        raise InputError(f"has features more than {_FARTHEST_PX:g} px away", path=f"frame {frame}")
     unknowns = Unknowns.population() if unknowns is None else unknowns
     spec = load_eye(prior) if isinstance(prior, str) else prior
     built = rig.build()

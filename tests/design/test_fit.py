@@ -424,3 +424,15 @@ def test_the_command_writes_an_eye_file_that_loads(tmp_path, capsys):
     assert run(["fit-eye", str(records), "-o", str(tmp_path / "x"), "--unknowns", str(tmp_path / "u.yaml")]) == 2
     assert not (tmp_path / "x").exists()
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("value", [1e30, -2e6])
+def test_features_far_outside_every_sensor_are_refused(value):
+    frames = frames_of("guestrin2006", most=2)
+    seen = er.trace(frames)
+    for change in (
+        {"pupil": replace(seen.pupil, centre_px=seen.pupil.centre_px + value)},
+        {"glints": replace(seen.glints, xy_px=seen.glints.xy_px + value)},
+    ):
+        with pytest.raises(er.InputError, match=r"frame 0: has features more than 1e\+06 px away"):
+            fit_eye(replace(seen, **change), frames.scene.rig)
