@@ -230,10 +230,18 @@ LINE = b'{"sample": 0, "file_name": "images/00000/a.png", "mask_file_name": null
 def _made(digest: str, backend: str = "llvm") -> dict[str, Any]:
     """Content of a done.json, or of a checkpoint, for one picture."""
     from eyerender.dataset.done import cpu_family, run_versions
+    from eyerender.dataset.rounding import rounding
 
     done = {"schema": "eyerender/shard/1", "shard": 0, "samples": [0, 1], "chosen": None, "images": 1, "digest": digest}
     done |= {"images_saturated": 0, "versions": run_versions(), "backend": {"name": backend, "device": "x"}}
-    done |= {"cpu": cpu_family(), "rejections": [], "given_up": [], "saturated": [], "seconds": 1.0}
+    done |= {
+        "cpu": cpu_family(),
+        "rounding": rounding(),
+        "rejections": [],
+        "given_up": [],
+        "saturated": [],
+        "seconds": 1.0,
+    }
     return done | {"files": {"images/00000/a.png": _hashed(b"x"), "shards/00000/lines.jsonl": _hashed(LINE)}}
 
 
