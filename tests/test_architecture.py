@@ -19,12 +19,12 @@ PACKAGE = Path(eyerender.__file__).resolve().parent
 
 # Lower floors know nothing of higher ones; packages on one floor do not import each other.
 FLOORS = {
-    "base": 0,
+    "base": 2640,
     "backends": 1,
     "optics": 1,
     "eye": 2,
     "region": 2,
-    "rig": 2,
+    "rig": 3140,
     "population": 3,
     "scene": 3,
     "folders": 4,
@@ -32,10 +32,10 @@ FLOORS = {
     "rendering": 5,
     "extraction": 5,
     "design": 6,
-    "gaze": 7,
+    "gaze": 4890,
     "imaging": 8,
     "report": 9,
-    "dataset": 9,
+    "dataset": 10040,  # growth that keeps old images readable; rounding of processors recorded; for long runs
     "torch": 10,
     "apps": 10,
     "cli": 11,
@@ -238,25 +238,25 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 85400,
+    "": 86400,
     "analytic": 730,
     "apps": 16300,
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
-    "base": 2560,  # one door for child processes and stored files; arguments of public functions checked, for all users
+    "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
     "cli": 2560,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
-    "dataset": 9910,
+    "dataset": 10040,  # growth that keeps old images readable; rounding of processors recorded; for long runs
     "design": 2810,
     "extraction": 7150,
     "eye": 3220,
     "folders": 1690,  # the reader of videos came from `extraction`, for the frames of benchmarks
-    "gaze": 4880,  # calibrations that survive blinks; tables of targets, features and gaze
+    "gaze": 4890,  # calibrations that survive blinks; tables of targets, features and gaze
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,
     "region": 4100,  # heads from STL and GLB files of any tool, with all mistakes named at once
     "rendering": 12520,
     "report": 970,
-    "rig": 3130,  # cameras and LEDs that serve one eye: headsets; exposure set by the lights
+    "rig": 3140,  # cameras and LEDs that serve one eye: headsets; exposure set by the lights
     "scene": 2160,  # instants, people and times in records; names and lengths that are refused where they are written
 }
 

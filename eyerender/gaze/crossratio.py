@@ -68,10 +68,8 @@ class CrossRatio(BuiltIn):
             for i in range(4):
                 rows = usable[np.linalg.norm(targets[usable] - corners[i], axis=1) <= near]
                 if not len(rows):
-                    raise InputError(
-                        f"{name} eye: no usable calibration target at the corner light {self.corners[i]}; this estimator "
-                        "needs lights at the four corners of the screen, and targets there"
-                    )
+                    needs = "this estimator needs lights at the screen's four corners, and targets there"
+                    raise InputError(f"{name} eye: no usable target at the corner light {self.corners[i]}; {needs}")
                 length = np.linalg.norm(glints[rows, i] - u_c[rows], axis=1)
                 alpha[i] = float(np.mean(np.linalg.norm(p[rows] - u_c[rows], axis=1) / length))
             found[eye] = alpha

@@ -153,7 +153,7 @@ def test_cross_ratio_recovers_alpha_and_gaze():
 
 def test_cross_ratio_refusals_and_statuses():
     seen = cross_ratio_data([2, 2, 2, 2])
-    with pytest.raises(InputError, match="no usable calibration target at the corner light 3"):
+    with pytest.raises(InputError, match="no usable target at the corner light 3"):
         CrossRatio().fit(seen.take(np.arange(3)), WORLD)
     with pytest.raises(InputError, match="one more light at the camera"):
         CrossRatio(at_camera=2).fit(seen, WORLD)
