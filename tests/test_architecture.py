@@ -19,12 +19,12 @@ PACKAGE = Path(eyerender.__file__).resolve().parent
 
 # Lower floors know nothing of higher ones; packages on one floor do not import each other.
 FLOORS = {
-    "base": 2640,
+    "base": 0,
     "backends": 1,
     "optics": 1,
     "eye": 2,
     "region": 2,
-    "rig": 3140,
+    "rig": 2,
     "population": 3,
     "scene": 3,
     "folders": 4,
@@ -32,10 +32,10 @@ FLOORS = {
     "rendering": 5,
     "extraction": 5,
     "design": 6,
-    "gaze": 4890,
+    "gaze": 7,
     "imaging": 8,
     "report": 9,
-    "dataset": 10040,  # growth that keeps old images readable; rounding of processors recorded; for long runs
+    "dataset": 9,
     "torch": 10,
     "apps": 10,
     "cli": 11,
