@@ -93,6 +93,17 @@ def test_compare_reads_the_folder_back(folder, capsys):
     assert {**again, "warnings": []} == json.loads((folder.parent / "result.json").read_text())
 
 
+def test_extract_of_its_files_with_the_scene_knows_their_windows(folder, capsys):
+    names = sorted(str(path) for path in (folder / "images").glob("*.png"))[:3]
+    assert run(["extract", *names, "--scene", "quickstart", "--json", "-"]) == 0
+    found = {r["frame"]: r for r in json.loads(capsys.readouterr().out)["records"]}
+    for entry in list(ImageFolder.load(folder))[:3]:
+        (truth,) = entry.records
+        own = found[truth["frame"]]
+        assert own["eye"] == truth["eye"]
+        assert np.allclose(own["pupil"]["centre_px"], truth["pupil"]["centre_px"], atol=1.0)
+
+
 def test_extract_of_the_folder_gives_records(folder, capsys):
     assert run(["extract", str(folder), "--json", "-"]) == 0
     data = json.loads(capsys.readouterr().out)

@@ -249,6 +249,7 @@ def sample_line(
     frame, instant, side = record["frame"], record["instant"], record["eye"]
     # Numbers of frames and instants are unique in the whole dataset.
     instants = frames // len(scene.rig.cameras)
+    exposed = scene.spec.sensor.model_dump(include={"exposure_ms", "gain_dn_per_e"}, exclude_none=True)
     record |= {
         "frame": turn.sample * frames + frame,
         "instant": turn.sample * instants + instant,
@@ -265,7 +266,7 @@ def sample_line(
             "subject_attempt": turn.subject_attempt,
             "draws": sample.draws,
         },
-        tree=sample.scene,
+        tree={**sample.scene, "sensor": {**sample.scene.get("sensor", {}), **exposed}},
         eye=sample.eye or None,
     )
     return image_name(turn.sample, frame, frames, side), line

@@ -140,7 +140,8 @@ class ImageObserver:
 
         Args:
             paths: images, or one folder.
-            scene: the scene whose rig took the images.
+            scene: the scene whose rig took the images. With it, files of a folder of this package are seen with their
+                windows.
             progress: called after each image.
             eyes: 1, or 2 for images of both eyes. The eye on the image's left is then the right eye, as a camera in
                 front of the subject sees it.
@@ -153,6 +154,9 @@ class ImageObserver:
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene, progress=progress)
         paths = files_of(paths)
+        if scene is not None and eyes == 1 and pictures is None and (entries := _rendered(paths)):
+            index = concatenate([entry.truth() for entry in entries]).index
+            return self.observe_entries(entries, index, [scene.rig] * len(index), progress=progress)
         if pictures is not None:
             _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
         gathered, skipped, coloured = Gathering(), list[InputWarning](), 0
@@ -237,6 +241,16 @@ class ImageObserver:
             lights, reasons = _lights(found, corner, rig, camera, eye_mm, int(index.eye[row]))
             parts.append(_observation(found, lights, reasons, corner, index.take([row])))
         return concatenate(parts)
+
+
+def _rendered(paths: Sequence[str | Path]) -> list[ImageEntry]:
+    """Return the entries of files in the metadata of the folder of this package that holds them all; else none."""
+    files = [Path(path).absolute() for path in paths]
+    home = next((place for place in files[0].parents[:3] if (place / METADATA).is_file()), None)
+    with suppress(InputError):
+        entries = {} if home is None else {entry.path: entry for entry in ImageFolder.load(home)}
+        return [entries[file] for file in files] if entries.keys() >= set(files) else []
+    return []
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

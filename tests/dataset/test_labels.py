@@ -124,6 +124,7 @@ def test_the_apparent_limbus_is_the_projected_circle(entries):
         line = entry.line
         labels = line["labels"]
         scene = SceneSpec.from_mapping(json.loads(line["parameters"]["scene_json"]))
+        assert scene.sensor.exposure_ms is not None  # also where the spec leaves it to the scene
         shape = json.loads(line["parameters"]["eye_json"])["cornea"][0]["shape"]
         R, q = shape["radius_mm"], shape["conic_constant"]
         rho = 5.85 - scene.look.limbus_width_mm / 2

@@ -119,7 +119,7 @@ def _ideal_seeds() -> list[bytes]:
     pupil = {"status": "ok", "centre_px": [32, 24], "semi_axes_px": [12, 12], "angle_rad": 0.0}
     said = {"lid": False, "bit_depth": 8, "polarity": "dark", "noise_dn": 1.0, "blur_px": 1.0, "step_dn": 100.0}
     record = {"pupil": pupil, "glints": [{"light": 0, "xy_px": [30, 20], "status": "ok"}]}
-    return _jsons({"file_name": "images/a.png", "records": [record], "parameters": said})()
+    return _jsons({"file_name": "images/00000000-right.png", "records": [record], "parameters": said})()
 
 
 def _beside_ideal(folder: Path) -> None:
@@ -224,7 +224,7 @@ def _hashed(data: bytes) -> dict[str, Any]:
     return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
-LINE = b'{"sample": 0, "file_name": "images/00000/a.png", "mask_file_name": null}\n'
+LINE = b'{"sample": 0, "file_name": "images/00000/00000000-right.png", "mask_file_name": null}\n'
 
 
 def _made(digest: str, backend: str = "llvm") -> dict[str, Any]:
@@ -242,7 +242,9 @@ def _made(digest: str, backend: str = "llvm") -> dict[str, Any]:
         "saturated": [],
         "seconds": 1.0,
     }
-    return done | {"files": {"images/00000/a.png": _hashed(b"x"), "shards/00000/lines.jsonl": _hashed(LINE)}}
+    return done | {
+        "files": {"images/00000/00000000-right.png": _hashed(b"x"), "shards/00000/lines.jsonl": _hashed(LINE)}
+    }
 
 
 @cache
@@ -261,7 +263,7 @@ def _checkpoint(path: Path) -> Any:
 
 def _beside_checkpoint(folder: Path) -> None:
     stage = folder / ".partial-00000-0"
-    for name, data in (("images/a.png", b"x"), ("shard/lines.jsonl", LINE)):
+    for name, data in (("images/00000000-right.png", b"x"), ("shard/lines.jsonl", LINE)):
         (stage / name).parent.mkdir(parents=True)
         (stage / name).write_bytes(data)
 
@@ -288,7 +290,7 @@ def _merge(path: Path) -> Any:
 
 
 def _beside_merge(folder: Path) -> None:
-    for name, data in (("images/00000/a.png", b"x"), ("shards/00000/lines.jsonl", LINE)):
+    for name, data in (("images/00000/00000000-right.png", b"x"), ("shards/00000/lines.jsonl", LINE)):
         (folder / name).parent.mkdir(parents=True)
         (folder / name).write_bytes(data)
 

@@ -159,8 +159,7 @@ class DatasetTruth:
         """Return the sample with the exposure in its line, because automatic exposure depends on the pixels."""
         if self.plan.spec.auto_exposure is None or found.sample is None:
             return found
-        stated = json.loads(line["parameters"]["scene_json"]).get("sensor", {}).get("exposure_ms")
-        return found if stated is None else found.exposed(stated)
+        return found.exposed(json.loads(line["parameters"]["scene_json"])["sensor"]["exposure_ms"])
 
 
 @dataclass
