@@ -288,7 +288,9 @@ def problem_of(
         raise InputError(f"hold neither a pupil nor a glint with a known light of the {side} eye", path="observations")
     position = index.eye_position_mm + np.nan_to_num(index.head_mm)
     if not np.isfinite(position).all():
-        raise InputError("is needed by a fit, at least roughly", path="eye_position_mm")
+        raise InputError(
+            "is needed, at least roughly: extract with --scene, or give a scene as the rig", path="eye_position_mm"
+        )
     eyes = stacked_eyes([spec.build(eye="left" if side == "left" else "right")])
     instant = instants_of(mine)
     first = np.unique(instant, return_index=True)[1]

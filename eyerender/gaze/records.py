@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from ..base.arrays import frozen
 from ..base.errors import InputError, Problems
-from ..base.spec import FileSpec, Positive, Spec, Vec3, read_yaml
+from ..base.spec import EYES, FileSpec, Positive, Spec, Vec3, read_yaml
 from ..base.storage.files import parse_json, read_text
 from ..rig.camera import CameraCalibration, EyeNames, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
@@ -51,8 +51,8 @@ def load_observations(
     Args:
         path: JSON as `features` writes it, which includes the rig; JSONL with one record a line; or a table (.csv or
             .tsv, see `observations_from_csv`).
-        scene: scene whose rig is used if the file has none.
-        rig: the rig to use instead, or a file that `load_rig` reads.
+        scene: scene whose rig is used if the file has none. Its subject also places eyes whose place is not recorded.
+        rig: the rig to use instead, or a file that `load_rig` reads; a scene's file places eyes, too.
         columns: meaning of a table's columns.
 
     Raises:
@@ -62,14 +62,17 @@ def load_observations(
     if scene is not None and rig is not None:
         raise InputError("give either a scene or a rig", source="--rig")
     given: RigGeometry | None = None
-    if scene is not None:
-        given = (scene if isinstance(scene, Scene) else load_scene(scene)).rig
+    if isinstance(rig, str | Path) and not _is_rig_file(rig):
+        scene, rig = str(rig), None
+    whole = load_scene(scene) if isinstance(scene, str) else scene
+    if whole is not None:
+        given = whole.rig
     elif rig is not None:
         given = load_rig(rig) if isinstance(rig, str | Path) else rig.build()
     if columns is not None or is_table(path):
         if given is None:
             raise InputError("holds no rig; give --rig or --scene", source=source)
-        return observations_from_csv(path, columns, given), given
+        return _placed(observations_from_csv(path, columns, given), whole), given
     records, own = _read(read_text(path, limit=MAX_RECORDS_BYTES), source)
     if not records:
         raise InputError("holds no records", source=source)
@@ -79,7 +82,17 @@ def load_observations(
     built = given or problems.attempt(lambda: rig_from_mapping(own, source=source))
     observations = problems.attempt(lambda: Observations.from_records(records, source=source))
     problems.check()
-    return observations, built
+    return _placed(observations, whole), built
+
+
+def _placed(observations: Observations, scene: Scene | None) -> Observations:
+    """Place eyes whose place is not recorded where the scene has them."""
+    index = observations.index
+    if scene is None or not (lost := np.isnan(index.eye_position_mm).any(axis=1) & (index.eye >= 0)).any():
+        return observations
+    eyes = np.array([scene.eye_position_mm(name) for name in EYES]) + scene.spec.subject.head_positions_mm[0]
+    place = np.where(lost[:, None], eyes[index.eye] - np.nan_to_num(index.head_mm), index.eye_position_mm)
+    return replace(observations, index=replace(index, eye_position_mm=frozen(place)))
 
 
 class RigFile(FileSpec, Rig):
@@ -94,9 +107,11 @@ def load_rig(path: str | Path) -> RigGeometry:
     Raises:
         InputError: naming the file and the key.
     """
-    if Path(path).suffix.lower() in (".yaml", ".yml") and "cameras" in read_yaml(path):
-        return RigFile.load(path).resolved(Path(path).parent).build()
-    return load_scene(path).rig
+    return RigFile.load(path).resolved(Path(path).parent).build() if _is_rig_file(path) else load_scene(path).rig
+
+
+def _is_rig_file(path: str | Path) -> bool:
+    return Path(path).suffix.lower() in (".yaml", ".yml") and "cameras" in read_yaml(path)
 
 
 def _read(text: str, source: str) -> tuple[list[Any], Any]:

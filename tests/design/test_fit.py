@@ -393,7 +393,7 @@ def test_what_cannot_be_fitted_is_named():
     frames = frames_of("head_mounted", most=2)
     seen = er.trace(frames)
     lost = replace(seen, index=replace(seen.index, eye_position_mm=np.full((2, 3), np.nan)))
-    with pytest.raises(er.InputError, match="eye_position_mm: is needed by a fit"):
+    with pytest.raises(er.InputError, match="eye_position_mm: is needed, at least roughly"):
         fit_eye(lost, frames.scene.rig)
 
 
