@@ -414,12 +414,16 @@ def _lids(line: dict[str, Any]) -> torch.Tensor:
 
 
 def _glints(line: dict[str, Any]) -> torch.Tensor:
-    """Places (lights, 3) of the reflections in px of the image, and whether they are visible; NaN where none is."""
+    """Places (lights, 3) of the reflections in px of the image, and whether they are visible; NaN where none is.
+
+    Where the lamp's centre has no reflection, the place is that of the part of the lamp that has one.
+    """
     window, labels = line["window_px"], line["labels"]
     out = torch.full((len(labels["lights_mm"]), 3), math.nan)
     for glint in labels["glints"]:
-        if glint["xy_px"] is not None:
-            x, y = glint["xy_px"]
+        place = glint["xy_px"] or glint["spot_xy_px"]
+        if place is not None:
+            x, y = place
             out[glint["light"]] = torch.tensor([x - window["x0"], y - window["y0"], float(glint["visible"])])
     return out
 

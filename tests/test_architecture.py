@@ -238,7 +238,7 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 86400,
+    "": 85530,  # what a dataset teaches by mistake, for those who train on it: dependences, shares, missing labels
     "analytic": 730,
     "apps": 16300,
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba

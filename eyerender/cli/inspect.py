@@ -58,6 +58,10 @@ def _text(data: dict[str, Any]) -> list[str]:
             lines.append(f"  {kind}: {first['image']}: {first['detail']}{more}")
         if not found["faults"]:
             lines.append("  no faults")
+        for own in found["missing"]:
+            names = ", ".join(own["labels"][:3]) + (", ..." if len(own["labels"]) > 3 else "")
+            cause = f"; depends on {own['depends_on']} ({own['rank_correlation']:+.2f})" if own["depends_on"] else ""
+            lines.append(f"  missing in {own['share']:.1%}: {names}{cause}")
         for outlier in found["outliers"][:5]:
             reason = outlier["reasons"][0]
             lines.append(f"  unusual: {outlier['image']}: {reason['column']} {reason['value']:.4g}, {reason['usual']}")

@@ -181,11 +181,14 @@ def visible_arcs_deg(
 
 
 def iris_outline(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[str, Any]:
-    """Compute the ellipse of the apparent limbus (`limbus_px`), with a status, and a reason if there is none."""
+    """Compute the ellipse of the limbus (`limbus_px`), with a status, and a reason if there is none.
+
+    It includes what the cornea hides of the limbus; `rim_hidden` tells whether it hides anything.
+    """
     nothing = {"centre_px": None, "semi_axes_px": None, "angle_rad": None}
     pixels, reason = limbus_px(scene, view, _OUTLINE_POINTS)
     hidden = {"rim_hidden": reason == RIM_HIDDEN}
-    if reason is not None:
+    if reason not in (None, RIM_HIDDEN):
         return {"status": "missing", "reason": reason, **nothing, **hidden}
     fit = fit_ellipse_direct(pixels)
     if not fit.ok:
@@ -207,7 +210,8 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     lower by the look's `limbus_aspect`.
 
     Returns:
-        The projected curve, and the reason why it is not visible as a whole (None if it is).
+        The projected curve, with the points that the cornea hides, and the reason why it is not visible as a whole
+        (None if it is).
     """
     surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
     rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
@@ -221,6 +225,8 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     reason = None
     if not front.all():
         reason = "behind the camera"
+    elif not facing.any():
+        reason = "the eye turns it away"
     elif not facing.all():
         reason = RIM_HIDDEN
     return np.asarray(pixels), reason

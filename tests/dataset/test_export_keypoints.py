@@ -38,16 +38,18 @@ def test_keypoints_have_places_in_the_image_and_are_visible_hidden_or_unknown():
     mask[14:17, 18:21] = 3
     pupil = {"amodal": {"centre_px": [119.2, 65.1], "semi_axes_px": [2.0, 1.5], "angle_rad": 0.0}}
     glints = [
-        {"light": 0, "xy_px": [118.0, 64.5], "visible": True},
-        {"light": 1, "xy_px": [121.0, 66.0], "visible": False},
-        {"light": 2, "xy_px": None, "visible": False},
-        {"light": 3, "xy_px": [150.0, 66.0], "visible": False},
+        {"light": 0, "xy_px": [118.0, 64.5], "spot_xy_px": [118.2, 64.5], "visible": True},
+        {"light": 1, "xy_px": [121.0, 66.0], "spot_xy_px": None, "visible": False},
+        {"light": 2, "xy_px": None, "spot_xy_px": None, "visible": False},
+        {"light": 3, "xy_px": [150.0, 66.0], "spot_xy_px": None, "visible": False},
+        {"light": 4, "xy_px": None, "spot_xy_px": [110.0, 60.0], "visible": True},  # its lamp's centre has no image
     ]
     along = [[105.0 + 2 * k, 60.0] for k in range(17)]
     item = item_of(mask, pupil=pupil, glints=glints, lid_margins_px={"upper": along, "lower": along[::-1]})
-    found = dict(zip(names(4), keypoints(item, 4), strict=True))
+    found = dict(zip(names(5), keypoints(item, 5), strict=True))
     assert found["pupil_centre"] == pytest.approx((19.2, 15.1, 2))
     assert [found[f"glint_{k}"] for k in range(4)] == [(18.0, 14.5, 2), (21.0, 16.0, 1), (0, 0, 0), (0, 0, 0)]
+    assert found["glint_4"] == (10.0, 10.0, 2)
     assert found["upper_lid_0"] == (5.0, 10.0, 2)
     assert found["upper_lid_8"] == (37.0, 10.0, 2)
     assert found["lower_lid_0"] == (37.0, 10.0, 2)

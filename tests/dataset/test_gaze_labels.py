@@ -12,7 +12,8 @@ from eyerender.dataset.export import teyed
 from eyerender.dataset.export.item import Item
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.folders.imagefolder import ImageEntry
-from eyerender.imaging.labels import EyeInWindow, entrance_diameter_mm, known_labels
+from eyerender.imaging.labels import RIM_HIDDEN, EyeInWindow, entrance_diameter_mm, known_labels, limbus_px
+from eyerender.optics.ellipse import Ellipse, signed_distance
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 
@@ -141,3 +142,33 @@ def test_entrance_diameter_is_what_the_analytic_observer_sees_on_the_axis(who):
     assert labels["pupil"]["entrance_diameter_mm"] == entrance_diameter_mm(eye)
     assert labels["pupil"]["stop_diameter_mm"] == scene.stop_diameter_mm(side)
     assert 1.08 < labels["pupil"]["entrance_diameter_mm"] / labels["pupil"]["stop_diameter_mm"] < 1.2
+
+
+def turned(*poses, camera_mm=(300, -31.5, 0)):
+    """A right eye with a round cornea, turned by (azimuth, elevation); its camera is straight ahead by default."""
+    camera = {"position_mm": list(camera_mm), "look_at_mm": [0, -31.5, 0], "focal_length_px": 6000}
+    lamp = {"position_mm": [300, 0, 30], "radius_mm": 2, "intensity_mw_sr": 100}
+    rig = {"cameras": [{**camera, "resolution_px": [640, 480]}], "lights": [lamp]}
+    angles = [{"azimuth_deg": a, "elevation_deg": e} for a, e in poses]
+    spec = {"format": 2, "name": "turned", "rig": rig, "poses": angles, "subject": {"eyes": ["right"]}}
+    return Scene.of(SceneSpec.from_mapping(spec))
+
+
+def test_the_iris_has_its_outline_in_views_to_80_degrees():
+    scene = turned(*((a, 0.4 * a) for a in range(-76, 78, 4)))
+    hidden = []
+    for frames, row, labels in labels_of(scene):
+        label = labels["iris"]["amodal"]
+        pixels, reason = limbus_px(scene, EyeInWindow.of(frames, row), 720)
+        assert (label["status"], label["reason"]) == ("ok", None)
+        assert label["rim_hidden"] == (reason == RIM_HIDDEN)
+        ellipse = Ellipse(label["centre_px"], label["semi_axes_px"], label["angle_rad"])
+        assert np.abs(signed_distance(ellipse, pixels)).max() < 1e-6
+        hidden.append(label["rim_hidden"])
+    assert 10 < sum(hidden) < len(hidden) - 10
+
+
+def test_an_eye_that_looks_away_has_no_iris():
+    ((_, _, labels),) = labels_of(turned((-60, 0), camera_mm=(-100, 268.5, 0)))
+    label = labels["iris"]["amodal"]
+    assert (label["status"], label["reason"], label["rim_hidden"]) == ("missing", "the eye turns it away", False)

@@ -165,3 +165,19 @@ def test_a_sound_dataset_has_no_faults(tmp_path):
     (own,) = inspect(tmp_path / "data")["datasets"]
     assert own["faults"] == {}
     assert own["subjects_in_two_splits"] == {}
+
+
+def test_labels_that_are_missing_are_reported_with_their_cause(tmp_path):
+    """The outline of the iris is taken away where the eye looks to the right by more than 12 degrees."""
+    draw(tmp_path / "data", 120)
+    planter = Planter(tmp_path / "data")
+    gone = [line for line in planter.lines if line["records"][0]["pose"]["azimuth_deg"] < -12]
+    for line in gone:
+        line["labels"]["iris"]["amodal"] |= {"status": "missing", "centre_px": None, "semi_axes_px": None}
+    planter.save()
+    (own,) = inspect(tmp_path / "data")["datasets"]
+    (missing,) = own["missing"]
+    assert missing["share"] == pytest.approx(len(gone) / 120)
+    assert "label iris x (px)" in missing["labels"]
+    assert missing["depends_on"] in ("label eye azimuth (deg)", "label gaze yaw (deg)")
+    assert abs(missing["rank_correlation"]) > 0.6

@@ -17,6 +17,7 @@ from ...dataset.validation.problems import is_number
 from ...folders.imagefolder import ImageEntry
 
 GLINTS = 8  # lights whose reflections are columns of their own
+GAZE_ANGLE = "label gaze off straight ahead (deg)"
 LABEL, DRAW, PERSON, PICTURE = "label ", "draw ", "person ", "picture "
 
 
@@ -53,6 +54,9 @@ def _labels(entry: ImageEntry) -> Iterator[tuple[str, float]]:
     pose = _mapping(record.get("pose"))
     for name in ("azimuth_deg", "elevation_deg"):
         yield from _one(f"{LABEL}eye {name.replace('_deg', ' (deg)')}", pose.get(name))
+    if is_number(pose.get("azimuth_deg")) and is_number(pose.get("elevation_deg")):
+        cosines = (math.cos(math.radians(pose[name])) for name in ("azimuth_deg", "elevation_deg"))
+        yield GAZE_ANGLE, math.degrees(math.acos(math.prod(cosines)))
     for part in ("pupil", "iris"):
         yield from _part(part, _mapping(labels.get(part)), (x0, y0))
     for key in ("entrance_diameter_mm", "stop_diameter_mm"):
@@ -67,6 +71,10 @@ def _labels(entry: ImageEntry) -> Iterator[tuple[str, float]]:
         yield f"{LABEL}gaze pitch (deg)", pitch
     if _is_point(apex, 3):
         yield f"{LABEL}distance of the eye (mm)", float(np.linalg.norm(apex))
+    axis = space.get("optic_axis")
+    if _is_point(axis, 3) and _is_point(apex, 3):
+        cosine = -float(np.dot(axis, apex)) / float(np.linalg.norm(axis) * np.linalg.norm(apex))
+        yield f"{LABEL}camera off the optic axis (deg)", math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
     margins = _mapping(labels.get("lid_margins_px"))
     upper, lower = margins.get("upper"), margins.get("lower")
     if isinstance(upper, list) and isinstance(lower, list) and len(upper) == len(lower) > 0:

@@ -12,6 +12,7 @@ import numpy as np
 from ...base.arrays import Floats
 from .duplicates import SimilarPair
 from .faults import KINDS
+from .missing import MissingLabels
 from .outliers import Outlier
 from .reading import Contents
 from .statistics import Distribution, strongest
@@ -33,6 +34,7 @@ class Inspection:
         outliers: the most unusual images.
         distributions: of each column.
         correlated: names of the columns that vary, and (m, m) their rank correlations.
+        missing: labels that more than 2 % of the images lack.
     """
 
     contents: Contents
@@ -43,6 +45,7 @@ class Inspection:
     outliers: list[Outlier]
     distributions: dict[str, Distribution]
     correlated: tuple[list[str], Floats]
+    missing: list[MissingLabels]
 
     @property
     def strongest(self) -> list[tuple[str, str, float]]:
@@ -79,6 +82,7 @@ class Inspection:
             ],
             "near_duplicates": [[self.name(p.first), self.name(p.second), p.correlation] for p in self.near[:_LISTED]],
             "columns": {name: d.to_mapping() for name, d in self.distributions.items()},
+            "missing": [asdict(one) for one in self.missing],
             "correlations": [list(pair) for pair in self.strongest],
         }
 

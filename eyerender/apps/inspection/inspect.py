@@ -17,6 +17,7 @@ from .comparing import Shift, has_subjects, only_in, shares, shifts
 from .duplicates import equal_pictures, near_duplicates
 from .faults import KINDS, Fault
 from .found import Inspection
+from .missing import missing_labels
 from .outliers import outliers
 from .reading import Contents, matrix, read, split_of_subjects
 from .statistics import distribution, rank_correlations
@@ -96,6 +97,7 @@ def examine(contents: Contents) -> Inspection:
         outliers=outliers(values, varying),
         distributions=distributions,
         correlated=(varying, rank_correlations(values)),
+        missing=missing_labels(contents),
     )
 
 

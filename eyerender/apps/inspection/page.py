@@ -161,6 +161,7 @@ def _dataset(found: Inspection, before: str) -> list[Section]:
     contents, pictures = found.contents, _Pictures(found.contents)
     sections: dict[str, Sequence[Content]] = {
         "Faults": _faults(found, pictures),
+        "Missing labels": _missing(found),
         "Outliers": _outliers(found, pictures),
         "Near-duplicates": _duplicates(found, pictures),
         "Splits": _splits(found),
@@ -191,6 +192,17 @@ def _faults(found: Inspection, pictures: _Pictures) -> list[Content]:
         Gallery(_fault_tiles(found, faults, pictures)),
         Table(("fault", "image", "what was found"), listed, "List of faults, up to 100 of each kind", (1, 2), True),
     ]
+
+
+def _missing(found: Inspection) -> list[Content]:
+    rows = [
+        (", ".join(own.labels), f"{own.share:.1%}", own.depends_on or "-", f"{own.rank_correlation:+.2f}")
+        for own in found.missing
+    ]
+    if not rows:
+        return ["No label is missing in more than 2 % of the images."]
+    header = ("labels", "missing in", "depends most on", "rank correlation")
+    return [Table(header, rows, "Labels that more than 2 % of the images lack", wide=(0, 2))]
 
 
 def _fault_tiles(found: Inspection, faults: Mapping[str, list[tuple[int, str]]], pictures: _Pictures) -> list[Picture]:

@@ -154,13 +154,10 @@ class Item:
         return bool(self.line["labels"][part]["visible"]["pixels"] > 0)
 
     def glints(self) -> list[tuple[int, float, float, bool]]:
-        """Return (light, x, y, visible) of each reflection that ray optics predicts."""
+        """Return (light, x, y, visible) of each reflection: of the lamp's centre, or else of the part that has one."""
         x0, y0 = self.entry.window[:2]
-        return [
-            (g["light"], g["xy_px"][0] - x0, g["xy_px"][1] - y0, g["visible"])
-            for g in self.line["labels"]["glints"]
-            if g["xy_px"] is not None
-        ]
+        placed = [(g, g["xy_px"] or g["spot_xy_px"]) for g in self.line["labels"]["glints"]]
+        return [(g["light"], at[0] - x0, at[1] - y0, g["visible"]) for g, at in placed if at is not None]
 
     def pixel_of(self, point_mm: Any) -> Floats:
         """Project a point (mm, camera frame) to a pixel, without lens distortion."""

@@ -197,11 +197,11 @@ def pupil_outline(line: dict[str, Any]) -> Outline | None:
 
 
 def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | None:
-    """Return the apparent limbus, recomputed or as the ellipse of the labels; None if there is none."""
+    """Return the visible limbus, recomputed or as the ellipse of the labels; None if the cornea hides a part of it."""
     if limbus_px is not None:
         return Outline(limbus_px, EXACT_PX)
     own = line.get("labels", {}).get("iris")
-    if not isinstance(own, dict) or own["amodal"]["status"] != "ok":
+    if not isinstance(own, dict) or own["amodal"]["status"] != "ok" or own["amodal"]["rim_hidden"]:
         return None
     return _ellipse(own["amodal"], LIMBUS_PX)
 

@@ -1,0 +1,69 @@
+"""Labels that some images lack, and what these images have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...base.arrays import Floats
+from .figures import LABEL, PICTURE
+from .reading import Contents
+from .statistics import rank_correlations
+
+_LEAST = 0.02
+_LEVELS = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissingLabels:
+    """Numbers of labels that the same images lack.
+
+    Attributes:
+        labels: their names.
+        share: of the images that were read.
+        depends_on: the number or group with which their lack is correlated most; None if nothing varies.
+        rank_correlation: Spearman's, of that number with the lack (1 or 0).
+    """
+
+    labels: list[str]
+    share: float
+    depends_on: str | None
+    rank_correlation: float
+
+
+def missing_labels(contents: Contents) -> list[MissingLabels]:
+    """List the labels that more than 2 % of the images lack, the most frequent lack first."""
+    readable = np.array([bool(name) for name in contents.names], dtype=bool)
+    lacking: dict[bytes, list[str]] = {}
+    for name, column in contents.columns.items():
+        gone = ~np.isfinite(column[readable])
+        if name.startswith(LABEL) and gone.mean() > _LEAST:
+            lacking.setdefault(gone.tobytes(), []).append(name)
+    # Places and shares in the picture follow from what is looked for: draws, people, angles, groups.
+    causes = {
+        name: column.astype(float)
+        for name, column in contents.columns.items()
+        if not name.startswith(PICTURE) and not name.endswith(("(px)", "(share)"))
+    } | levels(contents)
+    found = []
+    for pattern, names in lacking.items():
+        gone = np.frombuffer(pattern, dtype=bool)
+        columns = [gone.astype(float), *(column[readable] for column in causes.values())]
+        rho = np.nan_to_num(rank_correlations(np.stack(columns, axis=1))[0, 1:])
+        most = int(np.argmax(np.abs(rho))) if np.any(rho) else None
+        cause, value = (None, 0.0) if most is None else (list(causes)[most], float(rho[most]))
+        found.append(
+            MissingLabels(labels=sorted(names), share=float(gone.mean()), depends_on=cause, rank_correlation=value)
+        )
+    return sorted(found, key=lambda one: -one.share)
+
+
+def levels(contents: Contents) -> dict[str, Floats]:
+    """Convert groups of few values to numbers: a column per value, 1 for its images; two values need only one."""
+    out: dict[str, Floats] = {}
+    for group, values in contents.groups.items():
+        kinds = sorted({str(v) for v in values if v is not None})
+        for kind in kinds[-1:] if len(kinds) == 2 else kinds if 2 < len(kinds) <= _LEVELS else ():
+            out[f"{group} {kind}"] = np.array([str(v) == kind for v in values], dtype=float)
+    return out
