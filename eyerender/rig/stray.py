@@ -154,7 +154,9 @@ def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Wind
     cos, sin = np.cos(np.radians(opening.turn_deg)), np.sin(np.radians(opening.turn_deg))
     u = np.abs(x[None, :] * cos + y[:, None] * sin) / opening.half_size[0]
     v = np.abs(y[:, None] * cos - x[None, :] * sin) / opening.half_size[1]
-    # f is 1 on the edge; (1 - f) / |grad f| is the distance from it to first order.
+    # f is 1 on the edge; (1 - f) / |grad f| is the distance from it to first order. The centre, where that is 0 / 0, is
+    # given a direction.
+    u = np.where((u == 0) & (v == 0), 1e-9, u)
     p = opening.power
     most = np.maximum(np.maximum(u, v), 1e-9)
     u, v = u / most, v / most  # large powers would overflow

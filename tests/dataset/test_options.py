@@ -44,6 +44,32 @@ def test_the_camera_scales_with_the_size(tmp_path, camera):
     assert a.resolution_px == (640, 480)
 
 
+def test_lengths_in_pixels_scale_with_the_size(tmp_path):
+    drawn = {
+        "draw": "mixture",
+        "components": [
+            {"weight": 0.3, "draw": "fixed", "value": 2.0},
+            {"weight": 0.7, "draw": "uniform", "low": 1.0, "high": 3.0},
+        ],
+    }
+    star = {"draw": "choice", "values": [{"blades": 6}, {"blades": 6, "reach_px": 3}]}
+    data = {
+        "variables": {"edge": {"draw": "uniform", "low": 4, "high": 8}},
+        "scene.sensor.psf_sigma_px": drawn,
+        "scene.sensor.border_px": [6, 0, 0, 3],
+        "scene.lens": {"glare": 0.05, "star": star, "openings": [{"half_size": [1, 1], "edge_px": {"var": "edge"}}]},
+    }
+    path = write(tmp_path / "tiny.yaml", **data)
+    for sample in range(6):
+        a, b = (loaded(path, **size).draw(sample).build().spec for size in ({}, {"size": "48x36"}))
+        assert b.sensor.psf_sigma_px == pytest.approx(a.sensor.psf_sigma_px / 2)
+        assert b.sensor.sharpening_px == pytest.approx(a.sensor.sharpening_px / 2)  # its default, too
+        assert b.sensor.border_px == (3, 0, 0, 2)
+        assert b.lens.glare_radius_px == pytest.approx(a.lens.glare_radius_px / 2)
+        assert b.lens.openings[0].edge_px == pytest.approx(a.lens.openings[0].edge_px / 2)
+        assert b.lens.star.reach_px == {40: 20, 3: 2}[a.lens.star.reach_px]
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

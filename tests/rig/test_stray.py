@@ -180,6 +180,16 @@ def test_openings_are_fixed_to_the_sensor_not_to_the_window():
     assert np.allclose(transmission(opening, CAMERA, (40, 20, 100, 90)), whole[20:110, 40:140])
 
 
+@pytest.mark.parametrize("edge_px", [0.0, 4.0])
+def test_a_pixel_on_the_centre_of_an_opening_sees_through_it(edge_px):
+    small = Camera.looking_at([0, 0, 0], position_mm=[40, 0, 0], size_px=(100, 160), focal_length_px=75.0).build()
+    opening = Opening(centre=(0.05, -0.45), half_size=(0.4, 0.5), power=2.2, edge_px=edge_px)
+    through = transmission(opening, small, (0, 0, 100, 160))
+    x, y = round(50 * 1.05 - 0.5), round(80 - 50 * 0.45 - 0.5)
+    assert np.isfinite(through).all()
+    assert (through[y - 2 : y + 3, x - 2 : x + 3] > 0.9).all()
+
+
 def test_a_wide_rectangle_is_a_straight_edge():
     opening = Opening(centre=(0.0, -9.4), half_size=(30.0 / 2, 10.0), power=50, edge_px=0)
     through = transmission(opening, CAMERA, WHOLE)
