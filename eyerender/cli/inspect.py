@@ -22,6 +22,7 @@ def inspect(
     *,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     images: int = 100_000,
+    planned: bool = False,
     workers: AtLeastOne = None,
     json: Result = None,
 ) -> int:
@@ -30,10 +31,11 @@ def inspect(
     With a second dataset, the command also says which distributions differ.
 
     Args:
-        folder: A folder written by generate, or by render.
+        folder: A folder written by generate, or by render; with --planned a dataset spec.
         other: A second one, to compare with.
         output: An HTML page to write, with pictures.
         images: The largest number of images that are read of a dataset, spread evenly over it.
+        planned: Draw the samples of a spec instead of reading a folder, and say which draws depend on each other.
         workers: Number of processes that read them (default: all processors).
     """
     from ..apps.inspection import inspect as look
@@ -41,7 +43,8 @@ def inspect(
     if output is not None and output.suffix.lower() not in (".html", ".htm"):
         raise InputError("must end with .html", source="--output")
     with progress("reading") as steps:
-        data = look(folder, other, output=output, images=images, workers=workers or os.cpu_count() or 1, progress=steps)
+        cores = workers or os.cpu_count() or 1
+        data = look(folder, other, output=output, images=images, planned=planned, workers=cores, progress=steps)
     page = f"\n\npage: {output}" if output is not None else ""
     emit(data, "\n".join(_text(data)) + page, json)
     return 0
@@ -51,7 +54,12 @@ def _text(data: dict[str, Any]) -> list[str]:
     lines = []
     for found in data["datasets"]:
         splits = ", ".join(f"{name} {own['images']}" for name, own in found["splits"].items())
-        lines.append(f"{found['path']}: {found['images_read']} of {found['images']} images read; {splits}")
+        planned = "faults" not in found
+        done = "samples drawn" if planned else "images read"
+        lines.append(f"{found['path']}: {found['images_read']} of {found['images']} {done}; {splits}")
+        lines += [f"  {text}" for text in _dependences(found["dependences"])]
+        if planned:
+            continue
         for kind, own in found["faults"].items():
             first = own["images"][0]
             more = f" and {own['count'] - 1} more" if own["count"] > 1 else ""
@@ -73,3 +81,13 @@ def _text(data: dict[str, Any]) -> list[str]:
             before, after = shift["medians"]
             lines.append(f"  {shift['column']}: distance {shift['distance']:.3f}, median {before:.4g} and {after:.4g}")
     return lines
+
+
+def _dependences(found: list[dict[str, Any]] | None) -> list[str]:
+    if found is None:
+        return ["dependences: not tested, which needs 60 subjects"]
+    named = [one for one in found if not one["declared"]]
+    texts = [
+        f"dependence: {one['a']} and {one['b']} (rank correlation {one['rank_correlation']:+.2f})" for one in named
+    ]
+    return texts or ["no dependence of draws and labels that the spec does not declare"]

@@ -9,7 +9,6 @@ from ..base.errors import InputError
 from ..rig.imaging import Lens, Opening, Star
 from ..rig.sensor import Sensor
 from .draws import is_draw
-from .template import possible
 
 _OPTION = "--size"
 # Lengths in pixels, by the key of what they belong to; they are scaled also where the template leaves them out.
@@ -76,21 +75,11 @@ def _replaced(node: Any, factor: float, owner: str = "") -> Any:
         raise InputError("a calibrated camera has one size", source=_OPTION)
     camera = {**node, "resolution_px": [round(factor * n) for n in _numbers(node["resolution_px"])]}
     if node.get("focal_length_px") is not None:
-        camera["focal_length_px"] = _focal_length(node["focal_length_px"], factor)
+        camera["focal_length_px"] = _length(node["focal_length_px"], factor, "focal_length_px")
     if node.get("principal_point_px") is not None:
         # Pixel centres are at integers.
         camera["principal_point_px"] = [factor * (v + 0.5) - 0.5 for v in _numbers(node["principal_point_px"])]
     return camera
-
-
-def _focal_length(given: Any, factor: float) -> Any:
-    """Scale a focal length in pixels: a number, or an expression of variables."""
-    if isinstance(given, Mapping) and given.keys() == {"var"}:
-        return {"var": f"{factor!r} * ({given['var']})"}
-    (focal,) = possible(given) or [None]
-    if not isinstance(focal, int | float):
-        raise InputError("the focal length of a camera is drawn in pixels; make it a variable", source=_OPTION)
-    return factor * focal
 
 
 def _numbers(pair: Any) -> tuple[Any, ...]:

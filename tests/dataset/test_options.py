@@ -11,7 +11,7 @@ from eyerender.analytic.observer import trace
 from eyerender.base.errors import InputError
 from eyerender.dataset.options import PlanOptions
 from eyerender.dataset.plan import Plan
-from tests.support.dataset_specs import mapping, write
+from tests.support.dataset_specs import write
 
 
 def loaded(path, **options):
@@ -88,9 +88,12 @@ def test_wrong_options_are_refused(tmp_path, options, words):
     assert words in str(caught.value)
 
 
-def test_a_drawn_size_is_refused(tmp_path):
+def test_a_drawn_focal_length_is_scaled_and_a_drawn_size_refused(tmp_path):
     focal = {"draw": "uniform", "low": 2000, "high": 2400}
     path = write(tmp_path / "tiny.yaml", **{"scene.rig.cameras.0.focal_length_px": focal})
-    with pytest.raises(InputError, match="--size: the focal length of a camera is drawn"):
+    a, b = (loaded(path, **size).draw(0).build().rig.cameras[0] for size in ({}, {"size": "48x36"}))
+    assert b.K[0, 0] == pytest.approx(a.K[0, 0] / 2)
+    drawn = {"draw": "choice", "values": [[640, 480], [320, 240]]}
+    path = write(tmp_path / "drawn.yaml", **{"scene.rig.cameras.0.resolution_px": drawn, "scene.image.window_px": None})
+    with pytest.raises(InputError, match="--size: the size of a camera is drawn"):
         loaded(path, size="48x36")
-    assert mapping()["scene"]["image"]["window_px"] == [96, 72]

@@ -26,11 +26,15 @@ def numbers_of(entry: ImageEntry) -> dict[str, float]:
     line = entry.line
     parameters = _mapping(line.get("parameters"))
     found = dict(_labels(entry))
-    for before, key in ((DRAW, "draws"), (PERSON, "person")):
-        for name, value in _mapping(parameters.get(key)).items():
-            for at, number in _numbers(value):
-                found[f"{before}{name}{at}"] = number
+    found |= draws_of(_mapping(parameters.get("draws")))
+    found |= draws_of(_mapping(parameters.get("person")), PERSON)
     return {name: value for name, value in found.items() if math.isfinite(value)}
+
+
+def draws_of(values: Mapping[str, Any], before: str = DRAW) -> Iterator[tuple[str, float]]:
+    """Return the numbers among drawn values, by name."""
+    for name, value in values.items():
+        yield from ((f"{before}{name}{at}", number) for at, number in _numbers(value))
 
 
 def groups_of(entry: ImageEntry) -> dict[str, str]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
+from .dependence import Dependence
 from .duplicates import SimilarPair
 from .faults import KINDS
 from .missing import MissingLabels
@@ -35,6 +36,7 @@ class Inspection:
         distributions: of each column.
         correlated: names of the columns that vary, and (m, m) their rank correlations.
         missing: labels that more than 2 % of the images lack.
+        dependences: pairs of draws and labels that depend on each other; None if there are too few subjects to test.
     """
 
     contents: Contents
@@ -46,6 +48,7 @@ class Inspection:
     distributions: dict[str, Distribution]
     correlated: tuple[list[str], Floats]
     missing: list[MissingLabels]
+    dependences: list[Dependence] | None
 
     @property
     def strongest(self) -> list[tuple[str, str, float]]:
@@ -82,7 +85,8 @@ class Inspection:
             ],
             "near_duplicates": [[self.name(p.first), self.name(p.second), p.correlation] for p in self.near[:_LISTED]],
             "columns": {name: d.to_mapping() for name, d in self.distributions.items()},
-            "missing": [asdict(one) for one in self.missing],
+            "missing": [one._asdict() for one in self.missing],
+            "dependences": None if self.dependences is None else [one._asdict() for one in self.dependences],
             "correlations": [list(pair) for pair in self.strongest],
         }
 

@@ -19,6 +19,7 @@ from .faults import KINDS, Fault
 from .found import Inspection
 from .missing import missing_labels
 from .outliers import outliers
+from .planned import dependences_of, planned_mapping
 from .reading import Contents, matrix, read, split_of_subjects
 from .statistics import distribution, rank_correlations
 
@@ -33,16 +34,18 @@ def inspect(
     *,
     output: str | Path | None = None,
     images: int = IMAGES,
+    planned: bool = False,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Look into a dataset, and write a page about it.
 
     Args:
-        folder: the dataset's folder.
+        folder: the dataset's folder; with `planned`, its spec or the name of a shipped one.
         other: a second dataset, to which it is compared.
         output: the HTML page; None: no page.
         images: the largest number of images that are read of a dataset, spread evenly over it.
+        planned: draw the samples of a spec instead of reading a folder: splits, distributions and dependences of draws.
         workers: processes that read them; the result does not depend on their number.
         progress: called with (images read, images to read, what).
 
@@ -50,11 +53,16 @@ def inspect(
         What was found (`eyerender/inspection/1`): `datasets`, one or two, and `difference`.
 
     Raises:
-        InputError: a folder is not a dataset, or the page cannot be written to.
+        InputError: a folder is not a dataset, the page cannot be written to, or a plan is given with something else.
         EyerenderError: the page cannot be written.
     """
     if images < 1:
         raise InputError("must be >= 1", source="--images")
+    if planned:
+        if output is not None or other is not None:
+            raise InputError("takes one spec, and writes no page", source="--planned")
+        drawn = planned_mapping(folder, images, progress)
+        return {"schema": SCHEMA, "kinds": dict(KINDS), "datasets": [drawn], "difference": None}
     if output is not None:
         refuse_special(output)
     paths = [folder] if other is None else [folder, other]
@@ -85,7 +93,7 @@ def examine(contents: Contents) -> Inspection:
     near = near_duplicates(contents.thumbnails, contents.digests)
     for pair in near:
         contents.add(pair.second, Fault("near-duplicate", f"of {contents.names[pair.first]}: {pair.correlation:.5f}"))
-    distributions = {name: distribution(contents, name) for name in sorted(contents.columns)}
+    distributions = {name: distribution(name, contents.columns[name]) for name in sorted(contents.columns)}
     varying = [name for name, d in distributions.items() if len(d.counts)]
     values = matrix(contents, varying) if varying else np.zeros((len(contents), 0))
     return Inspection(
@@ -98,6 +106,7 @@ def examine(contents: Contents) -> Inspection:
         distributions=distributions,
         correlated=(varying, rank_correlations(values)),
         missing=missing_labels(contents),
+        dependences=dependences_of(contents),
     )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Floats
+from ...base.arrays import Floats, Objects
 from .figures import LABEL, PICTURE
 from .reading import Contents
 from .statistics import rank_correlations
@@ -15,16 +16,8 @@ _LEAST = 0.02
 _LEVELS = 8
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MissingLabels:
-    """Numbers of labels that the same images lack.
-
-    Attributes:
-        labels: their names.
-        share: of the images that were read.
-        depends_on: the number or group with which their lack is correlated most; None if nothing varies.
-        rank_correlation: Spearman's, of that number with the lack (1 or 0).
-    """
+class MissingLabels(NamedTuple):
+    """Labels that a share of the images lacks, and the number or group that is correlated most with their lack."""
 
     labels: list[str]
     share: float
@@ -45,7 +38,7 @@ def missing_labels(contents: Contents) -> list[MissingLabels]:
         name: column.astype(float)
         for name, column in contents.columns.items()
         if not name.startswith(PICTURE) and not name.endswith(("(px)", "(share)"))
-    } | levels(contents)
+    } | levels(contents.groups)
     found = []
     for pattern, names in lacking.items():
         gone = np.frombuffer(pattern, dtype=bool)
@@ -53,16 +46,14 @@ def missing_labels(contents: Contents) -> list[MissingLabels]:
         rho = np.nan_to_num(rank_correlations(np.stack(columns, axis=1))[0, 1:])
         most = int(np.argmax(np.abs(rho))) if np.any(rho) else None
         cause, value = (None, 0.0) if most is None else (list(causes)[most], float(rho[most]))
-        found.append(
-            MissingLabels(labels=sorted(names), share=float(gone.mean()), depends_on=cause, rank_correlation=value)
-        )
+        found.append(MissingLabels(sorted(names), float(gone.mean()), cause, value))
     return sorted(found, key=lambda one: -one.share)
 
 
-def levels(contents: Contents) -> dict[str, Floats]:
+def levels(groups: Mapping[str, Objects]) -> dict[str, Floats]:
     """Convert groups of few values to numbers: a column per value, 1 for its images; two values need only one."""
     out: dict[str, Floats] = {}
-    for group, values in contents.groups.items():
+    for group, values in groups.items():
         kinds = sorted({str(v) for v in values if v is not None})
         for kind in kinds[-1:] if len(kinds) == 2 else kinds if 2 < len(kinds) <= _LEVELS else ():
             out[f"{group} {kind}"] = np.array([str(v) == kind for v in values], dtype=float)

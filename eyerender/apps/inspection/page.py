@@ -19,6 +19,7 @@ from ...report.overlay import picture
 from ...report.page import Card, Content, Figure, Gallery, Key, Page, Section, Table, write_page
 from ...report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
 from .comparing import Shift, only_in, shares
+from .dependence import SUBJECTS
 from .faults import KINDS
 from .figures import DRAW, LABEL, PERSON, PICTURE
 from .found import Inspection
@@ -161,6 +162,7 @@ def _dataset(found: Inspection, before: str) -> list[Section]:
     contents, pictures = found.contents, _Pictures(found.contents)
     sections: dict[str, Sequence[Content]] = {
         "Faults": _faults(found, pictures),
+        "Dependences": _dependences(found),
         "Missing labels": _missing(found),
         "Outliers": _outliers(found, pictures),
         "Near-duplicates": _duplicates(found, pictures),
@@ -194,15 +196,23 @@ def _faults(found: Inspection, pictures: _Pictures) -> list[Content]:
     ]
 
 
+def _dependences(found: Inspection) -> list[Content]:
+    if found.dependences is None:
+        return [f"Not tested, which needs {SUBJECTS} subjects."]
+    rows = [(a, b, f"{rho:+.2f}", f"{p:.1e}", "yes" if ok else "no") for a, b, rho, p, ok in found.dependences]
+    count = sum(not own.declared for own in found.dependences)
+    text = f"{count or 'No'} pairs of draws and labels depend on each other without being declared to."
+    header = ("number", "number", "rank correlation", "p of the page", "declared")
+    return [text, Table(header, rows, "Pairs that depend on each other", wide=(0, 1), folded=True) if rows else None]
+
+
 def _missing(found: Inspection) -> list[Content]:
     rows = [
-        (", ".join(own.labels), f"{own.share:.1%}", own.depends_on or "-", f"{own.rank_correlation:+.2f}")
-        for own in found.missing
+        (", ".join(names), f"{share:.1%}", cause or "-", f"{rho:+.2f}") for names, share, cause, rho in found.missing
     ]
     if not rows:
         return ["No label is missing in more than 2 % of the images."]
-    header = ("labels", "missing in", "depends most on", "rank correlation")
-    return [Table(header, rows, "Labels that more than 2 % of the images lack", wide=(0, 2))]
+    return [Table(("labels", "missing in", "depends most on", "rank correlation"), rows, wide=(0, 2))]
 
 
 def _fault_tiles(found: Inspection, faults: Mapping[str, list[tuple[int, str]]], pictures: _Pictures) -> list[Picture]:

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.stats import rankdata
 
 from ...base.arrays import Floats, Ints, Reals
-from .reading import Contents
 
 BINS = 30
 _ENDS = (0.002, 0.998)  # numbers beyond these quantiles are counted in the first and the last bin
@@ -41,10 +40,9 @@ class Distribution:
         return {"n": self.count, **values, "edges": self.edges.tolist(), "counts": self.counts.tolist()}
 
 
-def distribution(contents: Contents, name: str) -> Distribution:
-    """Summarise a column."""
-    values = contents.columns[name].astype(float)
-    values = values[np.isfinite(values)]
+def distribution(name: str, column: Reals) -> Distribution:
+    """Summarise a column (n,); nan is no number."""
+    values = column[np.isfinite(column)].astype(float)
     quantiles = tuple(float(v) for v in np.quantile(values, _QUANTILES))
     edges, counts = np.zeros(0), np.zeros(0, dtype=np.int64)
     if quantiles[0] < quantiles[-1]:

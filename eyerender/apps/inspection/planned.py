@@ -1,0 +1,98 @@
+"""Which draws and labels of a folder depend on each other, and which draws of a plan, without rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...base.arrays import Floats, Ints, Objects, Reals
+from ...base.errors import InputError
+from ...base.progress import Progress, notify
+from ...dataset.draws import GridDraw, SequenceDraw
+from ...dataset.plan import Plan
+from ...dataset.spec import DatasetSpec
+from .dependence import Dependence, dependences
+from .figures import DRAW, LABEL, PERSON, draws_of
+from .missing import levels
+from .reading import Contents
+from .statistics import distribution
+
+_AZIMUTH = f"{LABEL}eye azimuth (deg)"
+_LABELS = (_AZIMUTH, f"{LABEL}eye elevation (deg)", f"{LABEL}pupil stop diameter (mm)")
+_SPLIT, _CAMERA, _EYE = _GROUPS = ("split", "camera", "eye")
+_ORDER = "order"
+# Kinds of names that belong together, or of which one follows from the other by physics.
+_RELATED = ({PERSON}, {LABEL, PERSON}, {LABEL, DRAW}, {_EYE, _CAMERA}, {_EYE}, {_CAMERA}, {_SPLIT})
+
+
+def dependences_of(contents: Contents) -> list[Dependence] | None:
+    """Test the draws, people, poses and pupils, splits, cameras, eyes and the order of a folder's images."""
+    try:
+        spec = DatasetSpec.from_mapping(contents.folder.dataset.get("spec") or {})
+        ordered = ordered_draws(Plan(spec=spec, eyes={}, files={}, base=Path()))
+    except InputError:
+        ordered = set()  # a folder that `render` wrote
+    numbers = _tested(contents.columns, contents.groups, contents.frames)
+    return dependences(numbers, contents.subjects, may_depend(ordered))
+
+
+def planned_mapping(given: str | Path | Plan, limit: int, progress: Progress | None) -> dict[str, Any]:
+    """Draw up to `limit` samples of a spec or a plan, spread evenly over it, and return what the JSON holds of them.
+
+    Raises:
+        InputError: the spec cannot be read, or a sample not be drawn.
+    """
+    plan = Plan.load(given)
+    samples = plan.spread(limit)
+    columns: dict[str, Floats] = {}
+    subjects, splits = np.zeros(len(samples), dtype=np.int64), np.full(len(samples), None, dtype=object)
+    for at, index in enumerate(samples):
+        sample = plan.draw(index)
+        subjects[at], splits[at] = sample.turn.subject, sample.split
+        for name, value in draws_of(sample.draws):
+            columns.setdefault(name, np.full(len(samples), np.nan))[at] = value
+        notify(progress, at + 1, len(samples), "samples")
+    numbers = _tested(columns, {_SPLIT: splits}, np.array(samples))
+    found = dependences(numbers, subjects, may_depend(ordered_draws(plan)))
+    own = {name: splits == name for name in sorted(set(splits.tolist()))}
+    return {
+        "path": plan.spec.name if isinstance(given, Plan) else str(given),
+        "images": plan.spec.count,
+        "images_read": len(samples),
+        "splits": {k: {"images": int(v.sum()), "subjects": len(set(subjects[v].tolist()))} for k, v in own.items()},
+        "columns": {name: distribution(name, column).to_mapping() for name, column in sorted(columns.items())},
+        "dependences": None if found is None else [one._asdict() for one in found],
+    }
+
+
+def ordered_draws(plan: Plan) -> set[str]:
+    """Return the names of draws that follow the order of a subject's samples: sequences and grids."""
+    drawn = {**plan.scene_template.draws, **plan.variable_template.draws}
+    return {f"{DRAW}{path}" for path, placed in drawn.items() if isinstance(placed.draw, SequenceDraw | GridDraw)}
+
+
+def may_depend(ordered: set[str]) -> Callable[[str, str], bool]:
+    """Return the test of whether two names depend on each other by the spec or by physics.
+
+    Sequences and grids depend on each other and on the order, and so do eyes and cameras that follow them. The azimuth
+    of an eye depends on which eye it is (vergence), and which eye is seen on the camera. See also `_RELATED`.
+    """
+    follows = any("eyes" in name or "cameras" in name for name in ordered)
+
+    def declared(a: str, b: str) -> bool:
+        kinds = {next((k for k in (LABEL, DRAW, PERSON, *_GROUPS) if name.startswith(k)), _ORDER) for name in (a, b)}
+        if all(name in ordered or name == _ORDER or (follows and name.startswith((_EYE, _CAMERA))) for name in (a, b)):
+            return True
+        if kinds == {DRAW}:  # numbers of one draw, such as a multivariate normal one
+            return a.partition("[")[0] == b.partition("[")[0]
+        return kinds in _RELATED or (_AZIMUTH in (a, b) and bool(kinds & {_EYE, _CAMERA}))
+
+    return declared
+
+
+def _tested(columns: Mapping[str, Reals], groups: Mapping[str, Objects], order: Ints) -> dict[str, Floats]:
+    numbers = {n: v.astype(float) for n, v in columns.items() if n.startswith((DRAW, PERSON)) or n in _LABELS}
+    return numbers | levels({k: groups[k] for k in _GROUPS if k in groups}) | {_ORDER: order.astype(float)}
