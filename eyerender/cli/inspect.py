@@ -66,6 +66,8 @@ def _text(data: dict[str, Any]) -> list[str]:
             lines.append(f"  {kind}: {first['image']}: {first['detail']}{more}")
         if not found["faults"]:
             lines.append("  no faults")
+        for name, shares in found["shares"].items():
+            lines.append(f"  {name}: " + ", ".join(f"{key} {share:.1%}" for key, share in shares.items()))
         for own in found["missing"]:
             names = ", ".join(own["labels"][:3]) + (", ..." if len(own["labels"]) > 3 else "")
             cause = f"; depends on {own['depends_on']} ({own['rank_correlation']:+.2f})" if own["depends_on"] else ""

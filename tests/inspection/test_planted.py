@@ -181,3 +181,27 @@ def test_labels_that_are_missing_are_reported_with_their_cause(tmp_path):
     assert "label iris x (px)" in missing["labels"]
     assert missing["depends_on"] in ("label eye azimuth (deg)", "label gaze yaw (deg)")
     assert abs(missing["rank_correlation"]) > 0.6
+
+
+def test_shares_are_those_of_the_labels(tmp_path):
+    draw(tmp_path / "data", 120)
+    planter = Planter(tmp_path / "data")
+    nowhere = {"centre_px": None, "semi_axes_px": None, "angle_rad": None, "pixels": 0, "cut": False}
+    margins = {lid: [[float(x), y] for x in range(5)] for lid, y in (("upper", 20.0), ("lower", 40.0))}
+    for row, line in enumerate(planter.lines):
+        blink = (0.0, 0.1, 0.5, 1.0)[row % 4]
+        line["labels"] |= {"lid_margins_px": margins, "eye_present": row % 10 > 0}
+        line["parameters"]["scene_json"] = json.dumps({"region": {"blink": blink}})
+        if row % 4 == 3:
+            line["labels"]["pupil"] |= {"visible_fraction": None, "visible": nowhere}
+    planter.save()
+    (own,) = inspect(tmp_path / "data")["datasets"]
+    poses = [line["records"][0]["pose"] for line in planter.lines]
+    cosines = [np.cos(np.radians([p["azimuth_deg"], p["elevation_deg"]])).prod() for p in poses]
+    ends = [0, 10, 20, 35, 180]
+    gaze = np.histogram(np.degrees(np.arccos(cosines)), ends)[0] / 120
+    assert list(own["shares"]["gaze"].values()) == pytest.approx(gaze.tolist())
+    assert own["shares"]["lids"] == {"open": 0.5, "half shut": 0.25, "shut": 0.25}
+    assert own["shares"]["pupil"] == {"hidden": 0.25, "half hidden": 0.0, "visible": 0.75}
+    assert own["shares"]["eye"] == {"none": 0.1, "there": 0.9}
+    assert own["shares"]["saturated pixels"] == {"to 20 %": 1.0, "more": 0.0}

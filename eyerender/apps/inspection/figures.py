@@ -6,6 +6,7 @@ same in all datasets, so two of them can be compared.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeGuard
@@ -17,8 +18,10 @@ from ...dataset.validation.problems import is_number
 from ...folders.imagefolder import ImageEntry
 
 GLINTS = 8  # lights whose reflections are columns of their own
-GAZE_ANGLE = "label gaze off straight ahead (deg)"
 LABEL, DRAW, PERSON, PICTURE = "label ", "draw ", "person ", "picture "
+GAZE_ANGLE, LIDS_SHUT = f"{LABEL}gaze off straight ahead (deg)", f"{LABEL}lids shut (share)"
+PUPIL_VISIBLE, EYE_PRESENT = f"{LABEL}pupil visible (share)", f"{LABEL}eye present"
+SATURATED = f"{PICTURE}saturated (share)"
 
 
 def numbers_of(entry: ImageEntry) -> dict[str, float]:
@@ -79,12 +82,22 @@ def _labels(entry: ImageEntry) -> Iterator[tuple[str, float]]:
     if _is_point(axis, 3) and _is_point(apex, 3):
         cosine = -float(np.dot(axis, apex)) / float(np.linalg.norm(axis) * np.linalg.norm(apex))
         yield f"{LABEL}camera off the optic axis (deg)", math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
-    margins = _mapping(labels.get("lid_margins_px"))
+    yield from _lids(entry)
+    if isinstance(labels.get("eye_present"), bool):
+        yield EYE_PRESENT, float(labels["eye_present"])
+
+
+def _lids(entry: ImageEntry) -> Iterator[tuple[str, float]]:
+    """Numbers of the lids, of which neither a bare eye nor a head mesh has any."""
+    margins = _mapping(entry.labels.get("lid_margins_px"))
     upper, lower = margins.get("upper"), margins.get("lower")
     if isinstance(upper, list) and isinstance(lower, list) and len(upper) == len(lower) > 0:
         middle = len(upper) // 2
         if _is_point(upper[middle], 2) and _is_point(lower[middle], 2):
             yield f"{LABEL}opening of the lids (px)", math.dist(upper[middle], lower[middle])
+    if margins:
+        region = json.loads(entry.line["parameters"]["scene_json"]).get("region")
+        yield LIDS_SHUT, float(_mapping(region).get("blink") or 0.0)
 
 
 def _part(part: str, own: Mapping[str, Any], origin: tuple[int, int]) -> Iterator[tuple[str, float]]:
@@ -97,7 +110,8 @@ def _part(part: str, own: Mapping[str, Any], origin: tuple[int, int]) -> Iterato
         yield f"{LABEL}{part} radius (px)", math.sqrt(abs(axes[0] * axes[1]))
         if axes[0]:
             yield f"{LABEL}{part} minor : major axis", axes[1] / axes[0]
-    yield from _one(f"{LABEL}{part} visible (share)", own.get("visible_fraction"))
+    there = bool(_mapping(own.get("visible")).get("pixels", 1))  # of a pupil in no pixel, the share is unknown
+    yield from _one(f"{LABEL}{part} visible (share)", own.get("visible_fraction") if there else 0.0)
 
 
 def _glints(glints: Any, origin: tuple[int, int]) -> Iterator[tuple[str, float]]:

@@ -36,6 +36,7 @@ class Inspection:
         distributions: of each column.
         correlated: names of the columns that vary, and (m, m) their rank correlations.
         missing: labels that more than 2 % of the images lack.
+        shares: of the images, in ranges of what matters to training.
         dependences: pairs of draws and labels that depend on each other; None if there are too few subjects to test.
     """
 
@@ -48,6 +49,7 @@ class Inspection:
     distributions: dict[str, Distribution]
     correlated: tuple[list[str], Floats]
     missing: list[MissingLabels]
+    shares: dict[str, dict[str, float]]
     dependences: list[Dependence] | None
 
     @property
@@ -85,6 +87,7 @@ class Inspection:
             ],
             "near_duplicates": [[self.name(p.first), self.name(p.second), p.correlation] for p in self.near[:_LISTED]],
             "columns": {name: d.to_mapping() for name, d in self.distributions.items()},
+            "shares": self.shares,
             "missing": [one._asdict() for one in self.missing],
             "dependences": None if self.dependences is None else [one._asdict() for one in self.dependences],
             "correlations": [list(pair) for pair in self.strongest],

@@ -22,6 +22,7 @@ from .outliers import outliers
 from .planned import dependences_of, planned_mapping
 from .reading import Contents, matrix, read, split_of_subjects
 from .statistics import distribution, rank_correlations
+from .training import shares_of
 
 SCHEMA = "eyerender/inspection/1"
 IMAGES = 100_000
@@ -106,6 +107,7 @@ def examine(contents: Contents) -> Inspection:
         distributions=distributions,
         correlated=(varying, rank_correlations(values)),
         missing=missing_labels(contents),
+        shares=shares_of(contents),
         dependences=dependences_of(contents),
     )
 

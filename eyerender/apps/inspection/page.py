@@ -162,6 +162,11 @@ def _dataset(found: Inspection, before: str) -> list[Section]:
     contents, pictures = found.contents, _Pictures(found.contents)
     sections: dict[str, Sequence[Content]] = {
         "Faults": _faults(found, pictures),
+        "Shares": [
+            Table(
+                ("quantity", "shares of the images"), [(k, _listed(own)) for k, own in found.shares.items()], wide=(1,)
+            )
+        ],
         "Dependences": _dependences(found),
         "Missing labels": _missing(found),
         "Outliers": _outliers(found, pictures),
@@ -194,6 +199,10 @@ def _faults(found: Inspection, pictures: _Pictures) -> list[Content]:
         Gallery(_fault_tiles(found, faults, pictures)),
         Table(("fault", "image", "what was found"), listed, "List of faults, up to 100 of each kind", (1, 2), True),
     ]
+
+
+def _listed(shares: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
 
 
 def _dependences(found: Inspection) -> list[Content]:

@@ -16,7 +16,7 @@ from ...base.errors import InputError
 from ...folders.imagefolder import ImageEntry
 from ...scene.parts import FRAME, IRIS, PUPIL
 from .faults import Fault
-from .figures import PICTURE
+from .figures import PICTURE, SATURATED
 
 SIDE = 16
 """Pixels of a thumbnail along each side."""
@@ -26,7 +26,6 @@ _BLACK, _WHITE = 0.03, 0.97
 _MASK_PX = 0.01
 _LEAST_PX = 20
 _MEAN = f"{PICTURE}mean level"
-_SATURATED = f"{PICTURE}saturated (share)"
 # Share of saturated pixels of a picture that counts as white, and least contrast of a pupil that can be seen.
 _MOSTLY, _LEAST_CONTRAST = 0.5, 0.01
 
@@ -71,7 +70,7 @@ def measure(entry: ImageEntry) -> PictureSummary:
     faults += _blank(thumbnail)
     mask = _mask(entry, image.shape, faults)
     numbers = _levels(codes)
-    if (share := numbers[_SATURATED]) > _MOSTLY and not faults:
+    if (share := numbers[SATURATED]) > _MOSTLY and not faults:
         faults.append(Fault("white", f"{share:.0%} of it is saturated"))
     if mask is not None:
         numbers |= _levels_of_parts(codes, mask, numbers[_MEAN])
@@ -124,7 +123,7 @@ def _levels(codes: Bytes) -> dict[str, float]:
     shares, levels = np.bincount(codes.ravel(), minlength=256) / codes.size, np.arange(256) / 255
     mean = float(shares @ levels)
     spread = float(np.sqrt(shares @ (levels - mean) ** 2))
-    return {_MEAN: mean, f"{PICTURE}spread of levels": spread, _SATURATED: float(shares[255])}
+    return {_MEAN: mean, f"{PICTURE}spread of levels": spread, SATURATED: float(shares[255])}
 
 
 def _levels_of_parts(codes: Bytes, mask: Bytes, mean: float) -> dict[str, float]:
