@@ -84,8 +84,10 @@ def _within(values: Floats, unit: Ints) -> tuple[Floats, Floats, Bools]:
     apart[np.abs(apart) < 1e-6] = 0.0
     squares = _sums(apart**2, unit)
     shared = (squares > 0).T.astype(float) @ (squares > 0)
-    sums = [_sums(column[:, None] * apart, unit) for column in apart.T]  # one (units, m) per number
-    total, spread = (np.stack([(s**power).sum(axis=0) for s in sums]) for power in (1, 2))
+    total, spread = np.zeros(shared.shape), np.zeros(shared.shape)
+    for k, column in enumerate(apart.T):
+        sums = _sums(column[:, None] * apart, unit)
+        total[k], spread[k] = sums.sum(axis=0), (sums**2).sum(axis=0)
     variance = (squares / np.maximum(np.bincount(unit)[:, None] - 1, 1)).T @ squares
     whole = squares.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -6,13 +6,13 @@ same in all datasets, so two of them can be compared.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeGuard
 
 import numpy as np
 
+from ...base.storage.files import parse_json
 from ...dataset.export.gaze import yaw_pitch_deg
 from ...dataset.validation.problems import is_number
 from ...folders.imagefolder import ImageEntry
@@ -96,8 +96,8 @@ def _lids(entry: ImageEntry) -> Iterator[tuple[str, float]]:
         if _is_point(upper[middle], 2) and _is_point(lower[middle], 2):
             yield f"{LABEL}opening of the lids (px)", math.dist(upper[middle], lower[middle])
     if margins:
-        region = json.loads(entry.line["parameters"]["scene_json"]).get("region")
-        yield LIDS_SHUT, float(_mapping(region).get("blink") or 0.0)
+        scene = parse_json(_mapping(entry.line.get("parameters")).get("scene_json") or "{}")
+        yield LIDS_SHUT, float(_mapping(_mapping(scene).get("region")).get("blink") or 0.0)
 
 
 def _part(part: str, own: Mapping[str, Any], origin: tuple[int, int]) -> Iterator[tuple[str, float]]:
