@@ -238,9 +238,9 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 85650,  # what a dataset teaches by mistake, for those who train on it: dependences, shares, missing labels
+    "": 85655,  # what a dataset teaches by mistake, for those who train on it: dependences, shares, missing labels
     "analytic": 730,
-    "apps": 16420,  # dependences that teach a network something false, missing labels, for those who make data
+    "apps": 16425,  # dependences that teach a network something false, missing labels, for those who make data
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
     "cli": 2560,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports

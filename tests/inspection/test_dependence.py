@@ -85,6 +85,7 @@ def test_what_the_spec_or_physics_gives_is_declared():
     azimuth, elevation = "label eye azimuth (deg)", "label eye elevation (deg)"
     pairs = [(SEQUENCE, "order"), (SEQUENCE, "eye right"), (GAZE, elevation), ("eye right", azimuth)]
     pairs += [("person age_years", "label pupil stop diameter (mm)"), ("draw x[0]", "draw x[1]")]
+    pairs += [("person flat_axis_deg", "eye right"), ("person flat_axis_deg", SEQUENCE)]
     for pair in pairs:
         assert declared(*pair), pair
         assert declared(*pair[::-1]), pair

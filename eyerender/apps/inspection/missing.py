@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...base.arrays import Floats, Objects
-from .figures import LABEL, PICTURE
+from .figures import DRAW, LABEL, PERSON
 from .reading import Contents
 from .statistics import rank_correlations
 
@@ -33,11 +33,11 @@ def missing_labels(contents: Contents) -> list[MissingLabels]:
         gone = ~np.isfinite(column[readable])
         if name.startswith(LABEL) and gone.mean() > _LEAST:
             lacking.setdefault(gone.tobytes(), []).append(name)
-    # Places and shares in the picture follow from what is looked for: draws, people, angles, groups.
+    # What labels are missing from is looked for in draws, people, angles, lengths and groups, not in other labels.
     causes = {
         name: column.astype(float)
         for name, column in contents.columns.items()
-        if not name.startswith(PICTURE) and not name.endswith(("(px)", "(share)"))
+        if name.startswith((DRAW, PERSON)) or name.endswith(("(deg)", "(mm)"))
     } | levels(contents.groups)
     found = []
     for pattern, names in lacking.items():

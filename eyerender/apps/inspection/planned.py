@@ -24,8 +24,10 @@ _AZIMUTH = f"{LABEL}eye azimuth (deg)"
 _LABELS = (_AZIMUTH, f"{LABEL}eye elevation (deg)", f"{LABEL}pupil stop diameter (mm)")
 _SPLIT, _CAMERA, _EYE = _GROUPS = ("split", "camera", "eye")
 _ORDER = "order"
+_NUMBERED = (f"{PERSON}seed", f"{PERSON}subject")  # say who a person is
 # Kinds of names that belong together, or of which one follows from the other by physics.
-_RELATED = ({PERSON}, {LABEL, PERSON}, {LABEL, DRAW}, {_EYE, _CAMERA}, {_EYE}, {_CAMERA}, {_SPLIT})
+_ALONE = ({PERSON}, {_EYE}, {_CAMERA}, {_SPLIT})
+_RELATED = (*_ALONE, {LABEL, PERSON}, {LABEL, DRAW}, {PERSON, _EYE}, {PERSON, _CAMERA}, {_EYE, _CAMERA})
 
 
 def dependences_of(contents: Contents) -> list[Dependence] | None:
@@ -78,12 +80,15 @@ def may_depend(ordered: set[str]) -> Callable[[str, str], bool]:
     """Return the test of whether two names depend on each other by the spec or by physics.
 
     Sequences and grids depend on each other and on the order, and so do eyes and cameras that follow them. The azimuth
-    of an eye depends on which eye it is (vergence), and which eye is seen on the camera. See also `_RELATED`.
+    of an eye depends on which eye it is (vergence), and which eye is seen on the camera. A person's numbers are those
+    of the eye that is seen. See also `_RELATED`.
     """
     follows = any("eyes" in name or "cameras" in name for name in ordered)
 
     def declared(a: str, b: str) -> bool:
         kinds = {next((k for k in (LABEL, DRAW, PERSON, *_GROUPS) if name.startswith(k)), _ORDER) for name in (a, b)}
+        if PERSON in kinds and {a, b} & ordered:
+            return True
         if all(name in ordered or name == _ORDER or (follows and name.startswith((_EYE, _CAMERA))) for name in (a, b)):
             return True
         if kinds == {DRAW}:  # numbers of one draw, such as a multivariate normal one
@@ -95,4 +100,5 @@ def may_depend(ordered: set[str]) -> Callable[[str, str], bool]:
 
 def _tested(columns: Mapping[str, Reals], groups: Mapping[str, Objects], order: Ints) -> dict[str, Floats]:
     numbers = {n: v.astype(float) for n, v in columns.items() if n.startswith((DRAW, PERSON)) or n in _LABELS}
+    numbers = {name: values for name, values in numbers.items() if name not in _NUMBERED}
     return numbers | levels({k: groups[k] for k in _GROUPS if k in groups}) | {_ORDER: order.astype(float)}
