@@ -46,15 +46,18 @@ def pairs_of(runs: Sequence[ExtractorResults]) -> list[dict[str, Any]]:
 
 
 def common_errors(runs: Sequence[ExtractorResults]) -> dict[str, Any]:
-    """Return errors on the pupils that all extractors detect, among extractors that detect any."""
+    """Return errors on the pupils that all extractors detect, among extractors that detect any.
+
+    Labels of the centre alone give no `boundary_px`: its `n` is then 0, and its figures are None.
+    """
     some = [run for run in runs if any(s.outcome == "right" for s in run.scores)]
     rows = [k for k in range(len(some[0].scores)) if all(r.scores[k].outcome == "right" for r in some)] if some else []
     return {
         "n": len(rows),
         "extractors": {
             run.extractor.name: {
-                "centre_px": sizes(np.array([run.scores[k].centre_px for k in rows], dtype=np.float64)),
-                "boundary_px": sizes(np.array([run.scores[k].boundary_px for k in rows], dtype=np.float64)),
+                name: sizes(np.array([v for k in rows if (v := getattr(run.scores[k], name)) is not None]))
+                for name in ("centre_px", "boundary_px")
             }
             for run in some
         },
