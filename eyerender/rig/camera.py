@@ -168,7 +168,7 @@ class Camera(Spec):
     def from_opencv(
         cls, path: str | Path, *, size_px: tuple[int, int] | None = None, unit_mm: float = 1.0, **fields: Any
     ) -> Self:
-        """Read a camera from a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML, JSON) or ROS (`camera_info`).
+        """Read a camera from a calibration file of OpenCV (`cv2.FileStorage`), ROS (`camera_info`) or a script.
 
         The file holds a camera matrix, distortion coefficients and, optionally, the image size and the pose (R and T,
         or rvec and tvec) in the world of this package: x_cam = R x_world + t.
@@ -180,7 +180,8 @@ class Camera(Spec):
             fields: `name`; instead of the file's pose, `position_mm`, `look_at_mm`, `pan_deg`, `tilt_deg`, `roll_deg`.
 
         Raises:
-            InputError: the file cannot be read, lacks a value, or uses an unsupported distortion model.
+            InputError: the file cannot be read, lacks a value, uses an unsupported distortion model, or has a key that
+                may describe the lens and is not read.
         """
         size = size_px or read_opencv(path).size_px
         if size is None:

@@ -1,12 +1,15 @@
-"""Read camera calibrations written by OpenCV and ROS.
+"""Read camera calibrations written by OpenCV, ROS and scripts.
 
 OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in YAML.
-All of them are read as plain data, without OpenCV.
+All of them are read as plain data, without OpenCV; so are YAML, JSON and .npz files of scripts, with the usual names.
+A key that may describe the lens and is not read is an error: half a calibration moves features by pixels.
 """
 
 from __future__ import annotations
 
+import io
 import re
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,19 +20,38 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.errors import InputError, Problems
 from ..base.spec import LARGEST, MAX_YAML_BYTES, parse_yaml
-from ..base.storage.files import parse_json, read_text, shown
+from ..base.storage.files import parse_json, read_bytes, read_text, shown
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 _SUPPORTED = 5
-# Names are compared in lower case, without underscores.
-_MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx")
-_DISTORTION = ("distortioncoefficients", "distcoeffs", "distortion", "dist", "d")
+# Names are compared in lower case, without punctuation.
+_MATRIX = ("cameramatrix", "k", "kk", "intrinsicmatrix", "intrinsics", "mtx", "matrix")
+_DISTORTION = (
+    "distortioncoefficients", "distortioncoeffs", "distortioncoeff", "distcoeffs", "distcoeff", "distcoefs",
+    "distortion", "dist", "d", "kc",
+)  # fmt: skip
 _ROTATION = ("r", "rotation", "rotationmatrix", "rvec", "rotationvector")
 _TRANSLATION = ("t", "tvec", "translation", "translationvector")
 _SIZES = (("imagewidth", "imageheight"), ("width", "height"))
-_SIZE = ("imagesize", "size", "resolution")
+_SIZE = ("imagesize", "size", "resolution", "cameraresolution", "imgsize")
+_MODEL = ("distortionmodel", "cameramodel", "camtype", "model")
+_FOCAL = ("fx", "fy", "cx", "cy")
+# What the writers state beside the lens: OpenCV's calibration programs, ROS, Pupil Labs, and common scripts in Python.
+_HARMLESS = """
+    calibrationtime calibrationdate nframes nrofframes framescount numframes numimages boardwidth boardheight boardsize
+    squaresize markersize patternsize aspectratio fixaspectratio flags avgreprojectionerror perviewreprojectionerrors
+    extrinsicparameters imagepoints gridpoints objpoints imgpoints objectpoints cameramatrixstddev distcoeffsstddev rms
+    rmserror ret error meanerror totalerror reprojectionerror meanreprojectionerror reprojerror rvecs tvecs
+    newcameramatrix newcameramtx optimalcameramatrix roi rectificationmatrix projectionmatrix binningx binningy header
+    cameraname name id serial serialnumber date time timestamp version fps fisheyemodel
+""".split()  # noqa: SIM905
+_LIKE_DISTORTION = re.compile(r"dist(?!ance)|coef|tangential|radial|fisheye|^[kps]\d$|^tau")
 _ONLY = "; only k1, k2, p1, p2, k3 of a pinhole camera are supported"
-_MODELS = ("plumb_bob", "rational_polynomial", "pinhole", "", None)
+_FISHEYE = (
+    "four coefficients in a column, without a model, may be a fisheye's, which is not supported; for a pinhole, add "
+    "distortion_model: plumb_bob"
+)
+_MODELS = ("plumbbob", "rationalpolynomial", "pinhole", "radtan", "radial", "brownconrady", "opencv", "")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,15 +80,27 @@ def read_opencv(path: str | Path) -> OpenCvCalibration:
         InputError: the file cannot be read, or uses an unsupported model; the message names the key.
     """
     source = str(path)
-    text = read_text(path, limit=MAX_YAML_BYTES)
-    data = {re.sub(r"[^a-z0-9]", "", key.lower()): (key, value) for key, value in _mapping(text, source).items()}
+    content = read_bytes(path, limit=MAX_YAML_BYTES)
+    found = (
+        _archive(content, source)
+        if content.startswith(b"PK")
+        else _mapping(read_text(path, limit=MAX_YAML_BYTES), source)
+    )
     problems = Problems(source)
+    data = _named(found, problems)
+    if "p" in data:
+        data.pop("r", None)  # a message of ROS: R rectifies, P projects what is rectified
 
     def array(names: tuple[str, ...]) -> tuple[str, Floats | None]:
         key, value = next((data[name] for name in names if name in data), (names[0], None))
         return key, None if value is None else problems.attempt(lambda: _array(value, source, key))
 
     key, K = array(_MATRIX)
+    if K is None and all(name in data for name in _FOCAL):
+        fx, fy, cx, cy = (_number(data[name], problems) for name in _FOCAL)
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if K is not None and K.shape in ((9,), (1, 9), (9, 1)):
+        K = K.reshape(3, 3)
     if K is None and len(problems) == 0:
         problems.add(f"missing; the file holds {shown(', '.join(k for k, _ in data.values()), 120)}", "camera_matrix")
     elif K is not None and K.shape != (3, 3):
@@ -77,6 +111,71 @@ def read_opencv(path: str | Path) -> OpenCvCalibration:
     problems.check()
     assert K is not None
     return OpenCvCalibration(K=K, distortion=distortion, R=R, t=t, size_px=size)
+
+
+def _named(found: dict[str, Any], problems: Problems) -> dict[str, tuple[str, Any]]:
+    """Return (key, value) by normalised name; report keys that may change the lens and that nothing here reads."""
+    data: dict[str, tuple[str, Any]] = {}
+    for key, value in found.items():
+        inner = {key: value}
+        if isinstance(value, dict) and "data" not in value and _plain(key) in (*_MATRIX, *_DISTORTION):
+            inner = value  # the numbers by name, as k1 and fx
+        for inner_key, one in inner.items():
+            if _plain(str(inner_key)) in data:
+                problems.add(f"is the same as {data[_plain(str(inner_key))][0]}; remove one", str(inner_key))
+            data[_plain(str(inner_key))] = (str(inner_key), one)
+    groups = (_MATRIX, _DISTORTION, _ROTATION, _TRANSLATION)
+    for group in groups:
+        twice = [data[name][0] for name in group if name in data and data[name][1] is not None]
+        if len(twice) > 1:
+            problems.add(f"says the same as {twice[0]}; remove one", twice[1])
+    known = {*_HARMLESS, *_FOCAL, *_SIZE, *_MODEL, *map(_plain, _COEFFICIENTS)}.union(*groups, *_SIZES)
+    if "p" in data and _count(data["p"][1]) == 12:
+        known.add("p")
+    for name, (key, value) in data.items():
+        if name not in known and (_LIKE_DISTORTION.search(name) or _is_numeric(value)):
+            reason = "may describe the lens, but is not a key that is read; remove it if it does not, else rename it"
+            problems.add(f"{reason} (camera_matrix, distortion_coefficients)", key)
+    return data
+
+
+def _plain(key: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
+def _is_numeric(value: Any) -> bool:
+    if isinstance(value, dict):
+        return "data" in value
+    if isinstance(value, list):
+        return bool(value) and all(map(_is_numeric, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _count(value: Any) -> int:
+    value = value.get("data") if isinstance(value, dict) else value
+    return sum(map(_count, value)) if isinstance(value, list) else 1
+
+
+def _number(given: tuple[str, Any], problems: Problems) -> float:
+    key, value = given
+    if not _is_numeric(value) or isinstance(value, list | dict) or not abs(value) <= LARGEST:
+        problems.add("must be a finite number", key)
+        return 0.0
+    return float(value)
+
+
+def _archive(content: bytes, source: str) -> dict[str, Any]:
+    """Read the arrays of an .npz file of NumPy."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(one.file_size for one in archive.infolist()) > 16 * MAX_YAML_BYTES:
+                raise InputError("unpacks to too much", source=source)
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return {name: arrays[name].tolist() for name in arrays.files}
+    except InputError:
+        raise
+    except Exception as error:  # zip files and NumPy's headers fail in many ways
+        raise InputError(f"is not an .npz file of plain numbers ({type(error).__name__})", source=source) from None
 
 
 def _mapping(text: str, source: str) -> dict[str, Any]:
@@ -105,11 +204,8 @@ def _xml(text: str, source: str) -> dict[str, Any]:
         raise InputError(f"is not valid XML: {error}", source=source) from None
     out: dict[str, Any] = {}
     for node in root:
-        if node.get("type_id") == "opencv-matrix":
-            out[node.tag] = {part.tag: _numbers(part.text) for part in node}
-        else:
-            out[node.tag] = _numbers(node.text) if len(node) == 0 else None
-    return {key: value for key, value in out.items() if value is not None}
+        out[node.tag] = {part.tag: _numbers(part.text) for part in node} if len(node) else _numbers(node.text)
+    return out
 
 
 def _numbers(text: str | None) -> Any:
@@ -126,7 +222,8 @@ def _array(value: Any, source: str, key: str) -> Floats:
     """Convert an OpenCV matrix, or nested lists, to an array of finite numbers."""
     shape = None
     if isinstance(value, dict):
-        shape, value = (value.get("rows"), value.get("cols")), value.get("data")
+        shape, value = value.get("sizes", [value.get("rows"), value.get("cols")]), value.get("data")
+        shape = shape if isinstance(shape, list) else [shape]
         value = value if isinstance(value, list) else [value]
     try:
         found = np.asarray(value)
@@ -139,17 +236,31 @@ def _array(value: Any, source: str, key: str) -> Floats:
     return np.asarray(found, dtype=float)
 
 
-def _distortion(key: str, found: Floats | None, data: dict[str, tuple[str, Any]], problems: Problems) -> Floats:
-    out = np.zeros(_SUPPORTED)
-    for name in ("distortionmodel", "cameramodel"):
-        named, model = data.get(name, ("", ""))
-        if model not in _MODELS:
+def _is_model_stated(data: dict[str, tuple[str, Any]], problems: Problems) -> bool:
+    """Return whether the file names its model; report one that is not supported."""
+    stated = [data[name] for name in _MODEL if name in data]
+    for named, model in stated:
+        if _plain(str(model or "")) not in _MODELS:
             problems.add(f"the model {shown(model)} is not supported{_ONLY}", named)
-    named, fisheye = data.get("fisheyemodel", ("", 0))
+    named, fisheye = data.get("fisheyemodel", ("", None))
     if fisheye not in (0, None):
         problems.add(f"the fisheye model is not supported{_ONLY}", named)
+    return bool(stated) or fisheye is not None
+
+
+def _distortion(key: str, found: Floats | None, data: dict[str, tuple[str, Any]], problems: Problems) -> Floats:
+    out = np.zeros(_SUPPORTED)
+    is_stated = _is_model_stated(data, problems)
+    flat = {name: data[_plain(name)] for name in _COEFFICIENTS if _plain(name) in data}
+    if flat and found is not None:
+        problems.add(f"says the same as {key}; remove one", next(iter(flat.values()))[0])
+    elif flat:
+        key = ", ".join(named for named, _ in flat.values())
+        found = np.array([_number(flat[name], problems) if name in flat else 0.0 for name in _COEFFICIENTS])
     if found is None:
         return out
+    if not is_stated and (found.shape == (4, 1) or list(flat) == ["k1", "k2", "k3", "k4"]):
+        problems.add(_FISHEYE, key)
     values = found.ravel()
     if len(values) > len(_COEFFICIENTS):
         problems.add(f"holds {len(values)} coefficients; OpenCV has at most {len(_COEFFICIENTS)}", key)
@@ -173,6 +284,8 @@ def _pose(
         return None, None
     if R.size == 3:
         R = rotation_of(R.ravel())
+    if R.size == 9:
+        R = R.reshape(3, 3)
     if R.shape != (3, 3):
         problems.add("must be a 3 x 3 matrix or a vector of 3 numbers", r_key)
     if t.size != 3:
@@ -199,6 +312,7 @@ def _size(data: dict[str, tuple[str, Any]], problems: Problems) -> tuple[int, in
         for name in _SIZE:
             if name in data:
                 key, given = data[name]
+                given = given.get("data") if isinstance(given, dict) else given
                 break
     if given is None:
         return None

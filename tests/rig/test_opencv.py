@@ -234,10 +234,137 @@ def test_a_dataset_counts_its_calibration_files(tmp_path):
     assert Plan.of(DatasetSpec.from_mapping(data), base=tmp_path).digest != plan.digest
 
 
+# What each writer states beside the lens: OpenCV's calibration sample and interactive program, scripts.
+SAMPLE = {
+    "nr_of_frames": 20, "board_width": 9, "board_height": 6, "square_size": 25.0, "flags": 0, "fisheye_model": 0,
+    "avg_reprojection_error": 0.31, "per_view_reprojection_errors": np.ones((20, 1)),
+    "extrinsic_parameters": np.ones((20, 6)), "image_points": np.ones((20, 54, 2)), "grid_points": np.ones((54, 3)),
+    "fix_aspect_ratio": 1.0,
+}  # fmt: skip
+INTERACTIVE = {
+    "calibrationDate": "today", "framesCount": 20, "cameraResolution": [640, 480], "cameraMatrix": K,
+    "cameraMatrix_std_dev": np.ones((4, 1)), "dist_coeffs": DISTORTION, "dist_coeffs_std_dev": np.ones((5, 1)),
+    "avg_reprojection_error": 0.31,
+}  # fmt: skip
+MESSAGE = {
+    "header": {"seq": 0, "stamp": {"secs": 0}}, "height": 480, "width": 640, "distortion_model": "plumb_bob",
+    "D": DISTORTION[0].tolist(), "K": K.ravel().tolist(), "R": np.eye(3).ravel().tolist(),
+    "P": np.eye(3, 4).ravel().tolist(), "binning_x": 0, "binning_y": 0, "roi": {"x_offset": 0, "height": 0},
+}  # fmt: skip
+FLAT = dict(zip(("k1", "k2", "p1", "p2", "k3"), DISTORTION[0].tolist(), strict=True))
+FOCAL = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+SIZE = {"image_width": 640, "image_height": 480}
+LISTED = {**SIZE, "camera_matrix": K.tolist()}
+PLACED: dict[str, Any] = {"position_mm": (600, 30, -150), "look_at_mm": (0, 0, 0)}
+
+
+def by_opencv(path, data):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in data.items():
+        storage.write(key, np.array(value) if isinstance(value, list) else value)
+    storage.release()
+
+
+def by_json(path, data):
+    path.write_text(json.dumps(data))
+
+
+def by_yaml(path, data):
+    path.write_text(yaml.safe_dump(data))
+
+
+def by_numpy(path, data):
+    np.savez(path, **data)
+
+
+NAMED = [
+    *(
+        {**LISTED, name: DISTORTION.tolist()}
+        for name in ("kc", "dist_coeff", "distCoeffs", "dist_coefs", "distortion_coeffs", "dist", "D", "Distortion")
+    ),
+    *({**SIZE, name: K.tolist(), "dist": DISTORTION[0].tolist()} for name in ("mtx", "K", "KK", "intrinsic_matrix")),
+    {**LISTED, **FLAT},
+    {**SIZE, **FOCAL, **FLAT},
+    {**SIZE, "intrinsics": FOCAL, "distortion": FLAT},
+    {**SIZE, "K": K.ravel().tolist(), "dist": DISTORTION[0].tolist()},
+    {**LISTED, "dist": DISTORTION.T.tolist(), "ret": 0.4, "rvecs": [[[0.1]] * 3], "tvecs": [[[9.0]] * 3]},
+    {**LISTED, "dist": DISTORTION[0].tolist(), "cam_type": "radial", "camera_name": "eye", "comment": "at noon"},
+]
+CASES_OF_WRITERS = [
+    *((by_opencv, suffix, {**values(), **SAMPLE}) for suffix in ("yml", "xml", "json")),
+    *((by_opencv, suffix, INTERACTIVE) for suffix in ("yml", "xml", "json")),
+    *((by_opencv, suffix, NAMED[8]) for suffix in ("yml", "xml", "json")),
+    *((by_opencv, suffix, NAMED[15]) for suffix in ("yml", "xml", "json")),
+    *((by_yaml, "yaml", data) for data in (ROS, MESSAGE)),
+    (by_json, "json", MESSAGE),
+    *((by_json, "json", data) for data in NAMED),
+    *((by_numpy, "npz", data) for data in (NAMED[5], NAMED[8], NAMED[12], NAMED[16])),
+]
+
+
+@pytest.mark.parametrize(("write", "suffix", "data"), CASES_OF_WRITERS)
+def test_files_of_every_writer_project_as_the_writer_does(tmp_path, write, suffix, data):
+    path = tmp_path / f"camera.{suffix}"
+    write(path, data)
+    assert_projects_as_opencv(er.Camera.from_opencv(path, **PLACED))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        *(({name: DISTORTION.tolist()}, f"{name}: may describe the lens") for name in (
+            "distorsion", "dist_coef_", "coefs", "distortion_coefficents", "radial_distortion", "koeff", "lens",
+        )),
+        ({"distorsion": "-0.2 0.1"}, "distorsion: may describe the lens"),
+        ({"k1": -0.2, "k7": 0.1}, "k7: may describe the lens"),
+        ({"k1": [0.1]}, "k1: must be a finite number"),
+        ({"k1": 0.1, "dist": [0.1, 0, 0, 0]}, "k1: says the same as dist; remove one"),
+        ({"dist": [0.1], "kc": [0.2]}, "kc: says the same as dist; remove one"),
+        ({"mtx": K.tolist()}, "mtx: says the same as camera_matrix; remove one"),
+        ({"CameraMatrix": K.tolist()}, "CameraMatrix: is the same as camera_matrix; remove one"),
+        ({"k4": 0.1, **FLAT}, "k4 must be 0"),
+        ({"dist": [[0.1], [0.2], [0.0], [0.0]]}, "dist: four coefficients in a column, without a model, may be a"),
+        ({"k1": 0.1, "k2": 0, "k3": 0, "k4": 0}, "k1, k2, k3, k4: four coefficients"),
+        ({"cam_type": "fisheye"}, "cam_type: the model 'fisheye' is not supported"),
+        ({"M2": K.tolist()}, "M2: may describe the lens"),
+        ({"P": [0.1, 0.2]}, "P: may describe the lens"),
+    ],
+)  # fmt: skip
+def test_calibrations_that_are_not_read_whole_are_refused_at_the_command(tmp_path, monkeypatch, capsys, changes, words):
+    monkeypatch.chdir(tmp_path)
+    by_json(tmp_path / "camera.json", {**LISTED, **changes})
+    data = scene_mapping({"file": "camera.json"}, position_mm=[600, 0, 0], look_at_mm=[0, 0, 0])
+    by_yaml(tmp_path / "scene.yaml", data)
+    assert run(["features", "scene.yaml"]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_four_coefficients_in_a_column_are_read_if_the_model_is_stated(tmp_path):
+    column = DISTORTION[0, :4, None].tolist()
+    by_json(tmp_path / "camera.json", {**LISTED, "dist": column, "distortion_model": "plumb_bob"})
+    camera = er.Camera.from_opencv(tmp_path / "camera.json", **PLACED).build()
+    assert camera.distortion.tolist() == [*DISTORTION[0, :4].tolist(), 0.0]
+
+
+def test_archives_that_are_no_calibrations(tmp_path):
+    path = tmp_path / "camera.npz"
+    path.write_bytes(b"PK\x03\x04 and no more")
+    with pytest.raises(InputError, match=r"is not an \.npz file of plain numbers"):
+        read_opencv(path)
+    np.savez(path, camera_matrix=np.array([K, None], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match=r"is not an \.npz file of plain numbers"):
+        read_opencv(path)
+    np.savez_compressed(path, camera_matrix=np.zeros(2**24))
+    with pytest.raises(InputError, match="unpacks to too much"):
+        read_opencv(path)
+
+
 @pytest.mark.parametrize("examples", [60, pytest.param(1500, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
 def test_garbled_calibrations(tmp_path, examples):
     good = [stored(tmp_path / f"camera.{suffix}").read_bytes() for suffix in ("yml", "xml", "json")]
     good.append(json.dumps(ROS).encode())
+    by_numpy(tmp_path / "camera.npz", NAMED[5])
+    good.append((tmp_path / "camera.npz").read_bytes())
     path = tmp_path / "bad.yml"
 
     @budget(examples)
