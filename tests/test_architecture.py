@@ -248,8 +248,8 @@ BOUNDS = {
     "design": 2810,
     "extraction": 7150,
     "eye": 3220,
-    "folders": 1690,  # the reader of videos came from `extraction`, for the frames of benchmarks
-    "gaze": 4890,  # calibrations that survive blinks; tables of targets, features and gaze
+    "folders": 1780,  # the reader of videos, for benchmarks; what is missing of cut and damaged ones, for their owners
+    "gaze": 4880,  # calibrations that survive blinks; tables of targets, features and gaze
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,

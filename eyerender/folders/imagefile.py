@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -34,6 +35,8 @@ FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
 
 
+# The end of a PNG or JPEG image, and the begin of another one.
+_FOLLOWED = re.compile(rb"IEND\xaeB`\x82\s*\x89PNG\r\n|\xff\xd9\s*\xff\xd8\xff")
 _WAITING = 8  # images of a `Writer`
 
 
@@ -198,7 +201,7 @@ def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDA
             raise InputError("is empty", source=source)
         # If Pillow warns, it either reads the image anyway or fails with an error.
         with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as file:
-            return _decoded(file, source, colour)
+            return _decoded(file, source, colour, _is_followed(data, file))
     except InputError:
         raise
     except MemoryError:
@@ -208,11 +211,23 @@ def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDA
         raise InputError("is not a readable image", source=source) from None
 
 
-def _decoded(file: Image.Image, source: str, colour: bool) -> tuple[NDArray[Any], int, bool]:
+def _is_followed(data: BinaryIO, file: Image.Image) -> bool:
+    """Return whether another image follows the first one in a PNG, JPEG or binary PGM file, where Pillow stops."""
+    place = data.tell()
+    data.seek(0)
+    content = data.read()
+    data.seek(place)
+    if file.format == "PPM" and content.startswith(b"P5"):
+        end = file.tile[0][2] + file.width * file.height * (1 if file.mode == "L" else 2)
+        return content[end:].lstrip().startswith(b"P5")
+    return _FOLLOWED.search(content) is not None
+
+
+def _decoded(file: Image.Image, source: str, colour: bool, is_followed: bool) -> tuple[NDArray[Any], int, bool]:
     if file.width * file.height > MAX_PIXELS:
         raise InputError(f"is too large ({file.width} x {file.height} pixels)", source=source)
     # Counting the frames would read the whole file.
-    if getattr(file, "is_animated", False):
+    if getattr(file, "is_animated", False) or is_followed:
         raise InputError("holds several images; give a file with one", source=source)
     if file.mode in COLOURED:
         return _from_colour(file, source, colour)

@@ -76,7 +76,7 @@ def observe_video(
         scene: the scene whose rig took the video.
         eyes: 1, or 2 for frames with both eyes, as in `ImageObserver.observe_files`.
         progress: called after each frame.
-        warn: receives a warning if frames have colour.
+        warn: receives a warning if frames have colour or are missing; if it raises, nothing is written.
     """
     count = pupils = ok = coloured = 0
     with ExitStack() as stack:
@@ -103,8 +103,8 @@ def observe_video(
             notify(progress, count, max(video.count, count), "frames")
         if file is not None and table:
             file.write(features_csv(gathered.all(), lights_of(scene)).encode())
-    if coloured and warn is not None:
-        warn([colour_warning(coloured, "frames")])
+        if warn is not None:  # before the files are published
+            warn([*video.warnings(), *([colour_warning(coloured, "frames")] if coloured else [])])
     return VideoSummary(
         source=video.source,
         frames=count,
