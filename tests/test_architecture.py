@@ -249,7 +249,7 @@ BOUNDS = {
     "extraction": 7150,
     "eye": 3220,
     "folders": 1780,  # the reader of videos, for benchmarks; what is missing of cut and damaged ones, for their owners
-    "gaze": 4880,  # calibrations that survive blinks; tables of targets, features and gaze
+    "gaze": 5080,  # calibrations that survive blinks; tables of other trackers, compared with the rig, for their users
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,

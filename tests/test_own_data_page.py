@@ -17,6 +17,7 @@ import eyerender as er
 from eyerender.cli.main import run
 from eyerender.gaze.columns import CsvColumns, EyeColumns
 from tests.support.paths import ROOT
+from tests.support.pupil_core import write_export
 
 PAGE = (ROOT / "docs" / "own_data.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", PAGE, re.DOTALL)
@@ -43,6 +44,7 @@ def recording(page):
         cv2.circle(frame, (160 + 2 * k, 120), 30, (20, 20, 20), -1, cv2.LINE_AA)
         writer.write(cv2.GaussianBlur(frame, (0, 0), 1.5))
     writer.release()
+    write_export(page)
 
 
 def export(path):

@@ -54,6 +54,9 @@ class CsvColumns(FileSpec, EyeColumns):
     left: EyeColumns | None = None
 
     eyes: dict[str, Literal["right", "left"]] = Field(default={}, description="what the words in `eye` mean")
+    method: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="detector whose rows are read, as the column `method` begins, if it names several"
+    )
     axes: Literal["full", "semi"] | None = Field(default=None, description="default: semi if the name says so, or full")
     angle_unit: Literal["deg", "rad"] | None = Field(default=None, description="default: rad if the name says so")
     offset_px: Vec2 = Field(default=(0.0, 0.0), description="added to all positions in the image")
@@ -116,6 +119,8 @@ def completed(given: CsvColumns, header: list[str], told: str, problems: Problem
     wrong.check()
     free = [name for name in header if name not in named]
     found = _found(free, problems)
+    if ("time" in found or "time" in data) and found.get("frame", "").strip().lower() == "world_index":
+        del found["frame"]  # counts frames of the world's camera, of which each has several of an eye's
     for side in EYES:
         if side in data or (side in found and not set(EyeColumns.model_fields) & set(data)):
             data[side] = {**found.pop(side, {}), **data.get(side, {})}

@@ -23,7 +23,7 @@ from ..base.errors import InputError, Problems
 from ..base.status import Status
 from ..base.storage.files import csv_text, read_text, shown
 from ..rig.light import MAX_LIGHTS
-from ..rig.rig import RigLike
+from ..rig.rig import RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from ..scene.observation import (
     EYES,
@@ -42,6 +42,7 @@ from .columns import CsvColumns, EyeColumns, completed
 MAX_TABLE_BYTES, MAX_COLUMNS, MAX_ROWS = 64 * 2**20, 1000, 1_000_000
 # Larger numbers could not be squared.
 _LARGEST = 1e30
+_OF_TARGETS = ("time", "frame", "target", "target_unit", "target_origin", "screen_px", "delimiter")
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-"))
 _EYE_WORDS = {
     **dict.fromkeys(("right", "r", "od", "0", "0.0", "eye0"), "right"),
@@ -69,12 +70,16 @@ def observations_from_csv(
         InputError: naming the wrong lines and columns.
     """
     table, named = _opened(path, columns)
-    screen = None if rig is None else rig.build().screen
-    return _observations(table, named, screen)
+    return _observations(table, named, None if rig is None else rig.build())
 
 
-def _opened(path: str | Path, columns: str | Path | Mapping[str, Any] | CsvColumns | None) -> tuple[_Table, CsvColumns]:
-    """Read a table, and complete the meaning of its columns by their names."""
+def _opened(
+    path: str | Path, columns: str | Path | Mapping[str, Any] | CsvColumns | None, *, of_targets: bool = False
+) -> tuple[_Table, CsvColumns]:
+    """Read a table, and complete the meaning of its columns by their names.
+
+    A table of targets shares the file of columns with a recording, so it need not have the columns of that.
+    """
     if columns is None:
         given = CsvColumns()
     elif isinstance(columns, CsvColumns):
@@ -83,6 +88,13 @@ def _opened(path: str | Path, columns: str | Path | Mapping[str, Any] | CsvColum
         given = CsvColumns.load(columns) if isinstance(columns, str | Path) else CsvColumns.from_mapping(columns)
     told = str(columns) if isinstance(columns, str | Path) else "columns"
     table = _Table.read(path, given.delimiter)
+    if of_targets:
+        there = {*table.header, None}
+        own = {key: value for key, value in given.to_mapping().items() if key in _OF_TARGETS}
+        missing = [key for key in ("time", "frame") if own.get(key) not in there]
+        missing += [] if there.issuperset(own.get("target", ())) else ["target"]
+        given = CsvColumns.from_mapping({key: value for key, value in own.items() if key not in missing})
+    table.choose_method(given.method)
     return table, completed(given, table.header, told, table.problems)
 
 
@@ -130,6 +142,21 @@ class _Table:
 
     def __len__(self) -> int:
         return len(self.lines)
+
+    def choose_method(self, wanted: str | None) -> None:
+        """Keep the rows of one detector, if a column `method` names several, as Pupil Labs' exports do."""
+        column = next((name for name in self.header if name.lower() == "method"), None)
+        words = [cell.strip() for cell in self.cells[column]] if column else []
+        named = shown(", ".join(sorted(set(words))), 150)
+        kept = [k for k, word in enumerate(words) if wanted is None or word.lower().startswith(wanted.lower())]
+        if words and not kept:
+            raise InputError(f"has no rows of the method {shown(wanted)}, but of {named}", source=self.source)
+        if len({words[k] for k in kept}) > 1:
+            reason = f"has rows of several detectors ({named}); choose one with 'method' in --columns"
+            raise InputError(reason, source=self.source)
+        if kept:
+            self.lines = [self.lines[k] for k in kept]
+            self.cells = {name: [cells[k] for k in kept] for name, cells in self.cells.items()}
 
     def refuse(self, row: int, column: str, reason: str) -> None:
         self.problems.add(reason, f"line {self.lines[row]}.{column}")
@@ -186,13 +213,13 @@ class _Table:
         return out
 
 
-def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> Observations:
+def _observations(table: _Table, columns: CsvColumns, rig: RigGeometry | None) -> Observations:
     parts = _parts(table, columns)
     n = len(table)
     eye = np.concatenate([eye for _, eye in parts])
     # One entry for each part of each row.
     line = np.tile(np.arange(n), len(parts))
-    frame, camera = _frames(table, columns, eye)[line], table.counts(columns.camera, 0)[line]
+    frame, camera = _frames(table, columns, eye)[line], _cameras(table, columns, eye, rig)
     fixation, light = table.counts(columns.fixation, -1)[line], table.counts(columns.light, -1, MAX_LIGHTS - 1)[line]
     width = max(len(part.glints or ()) for part, _ in parts)
     if len(line) * width > MAX_GLINTS:
@@ -200,7 +227,7 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
     times = _times(table, columns)[line]
     features = [_features(table, part, columns, width) for part, _ in parts]
     values = {key: np.concatenate([part[key] for part in features]) for key in features[0]}
-    values["target"] = _targets(table, columns, screen)[line]
+    values["target"] = _targets(table, columns, None if rig is None else rig.screen)[line]
     table.problems.check()
 
     # One observation for each eye of each frame, in order; the right eye comes first.
@@ -246,6 +273,16 @@ def _observations(table: _Table, columns: CsvColumns, screen: ScreenPlane | None
             xy_px=np.where(seen[..., None], found["glints"], np.nan),
         ),
     )
+
+
+def _cameras(table: _Table, columns: CsvColumns, eye: Ints, rig: RigGeometry | None) -> Ints:
+    """Return the camera of each entry (n,): as its column says, or the one that sees its eye, as in headsets."""
+    camera = np.resize(table.counts(columns.camera, 0), len(eye))
+    if rig is not None and columns.camera is None:
+        for k, side in enumerate(EYES):
+            seeing = [c for c, one in enumerate(rig.cameras) if one.sees(side)]
+            camera[eye == k] = seeing[0] if len(seeing) == 1 else 0
+    return camera
 
 
 def _refuse_repeats(table: _Table, keys: Ints, line: Ints, first: Ints) -> None:
@@ -453,7 +490,7 @@ def read_targets(
     Raises:
         InputError: naming the wrong lines and columns.
     """
-    table, named = _opened(path, columns)
+    table, named = _opened(path, columns, of_targets=True)
     if named.target is None:
         raise InputError("has no target (target_x, target_y, target_z in mm; or target_x_mm, ...)", source=table.source)
     kind = "frame" if named.frame is not None else "time"
