@@ -131,6 +131,7 @@ def predict(
     from ..base.storage.files import refuse_special, write_text
     from ..gaze.builtin import BuiltIn
     from ..gaze.columns import CsvColumns
+    from ..gaze.conventions import convention_warnings
     from ..gaze.predictions import gaze_csv, predictions, refuse_nothing
     from ..gaze.rays import eye_name
     from ..gaze.records import load_observations
@@ -142,8 +143,8 @@ def predict(
     observations, built = load_observations(
         records, None if scene is None else heed.scene(scene), rig=rig, columns=columns
     )
-    if calibrated is not None:
-        heed(rig_warnings(built, calibrated, scene or rig or str(records)))
+    other = [] if calibrated is None else rig_warnings(built, calibrated, scene or rig or str(records))
+    heed(other or convention_warnings(observations, built, str(records)))
     if screen_px is None and columns is not None:
         screen_px = CsvColumns.load(columns).screen_px
     if output is not None:

@@ -59,13 +59,22 @@ class CsvColumns(FileSpec, EyeColumns):
     )
     axes: Literal["full", "semi"] | None = Field(default=None, description="default: semi if the name says so, or full")
     angle_unit: Literal["deg", "rad"] | None = Field(default=None, description="default: rad if the name says so")
+    pupil_unit: Literal["px", "fraction"] | None = Field(
+        default=None,
+        description="unit of pupils and glints: px, or shares of the picture's sides; default: as the names say",
+    )
+    pupil_origin: Literal["top-left", "bottom-left"] = Field(
+        default="top-left", description="where pupils and glints count from"
+    )
     offset_px: Vec2 = Field(default=(0.0, 0.0), description="added to all positions in the image")
     min_confidence: float | None = Field(default=None, description="pupils below it are missing")
-    target_unit: Literal["mm", "px", "fraction"] | None = Field(
-        default=None, description="unit of targets on the screen; default: as the names say"
+    target_unit: Literal["mm", "px", "fraction", "deg", "height", "norm"] | None = Field(
+        default=None,
+        description="unit of targets on the screen: deg at the eyes, heights of the screen, or norm, from -1 to 1; "
+        "default: as the names say",
     )
     target_origin: Literal["centre", "top-left", "bottom-left"] | None = Field(
-        default=None, description="where targets on the screen count from; default: the centre for mm, or the top left"
+        default=None, description="where targets on the screen count from; default: the top left for px and fraction"
     )
     screen_px: tuple[Positive, Positive] | None = Field(default=None, description="width and height of the screen, px")
     eye_position_mm: dict[Literal["right", "left"], Vec3] = Field(

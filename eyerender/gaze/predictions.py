@@ -153,9 +153,18 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
             found = estimator.predict_rays(some, rig).origin_mm
         else:
             continue
-        known = np.isfinite(found).all(axis=1)
+        known = _plausible(found, rig)
         place[rows[known]], source[rows[known]] = found[known], name
     return place, source
+
+
+def _plausible(place: Floats, rig: RigGeometry) -> Bools:
+    """Return whether estimated places (n, 3) mm can be those of eyes: 10 mm to 3 m in front of every camera."""
+    ok: Bools = np.isfinite(place).all(axis=1)
+    for camera in rig.cameras:
+        away = place - camera.nodal_point_mm
+        ok = np.asarray(ok & (np.abs(np.linalg.norm(away, axis=1) - 1505.0) < 1495.0))
+    return ok
 
 
 def _screen_angles(point_mm: Floats, eye_mm: Floats, screen: ScreenPlane | None) -> Floats:

@@ -15,6 +15,7 @@ from ..rig.plausibility import target_warnings
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
 from .builtin import BuiltIn, EstimatorOptions
+from .conventions import convention_warnings
 from .determined import undetermined_to
 from .estimate import GazeEstimator
 from .estimators import ESTIMATORS, estimator_class, name_of
@@ -63,8 +64,8 @@ def fit_estimator(
         rig: the rig that observed them.
         fixations: fixations for the calibration, counted from 0; None: all.
         source: name of the observations in messages.
-        warn: called for targets off the screen, if the targets do not determine the estimator, and for a calibration
-            that misses its own targets; it may raise.
+        warn: called for targets off the screen, features in conventions that do not fit the rig, targets that do not
+            determine the estimator, and a calibration that misses its own targets; it may raise.
 
     Raises:
         InputError: there are no targets, a fixation does not exist, or the estimator cannot be calibrated.
@@ -84,7 +85,7 @@ def fit_estimator(
     reasons = wrong_rows(given)
     used = given.take(is_none(reasons))
     if warn is not None:
-        warn(target_warnings(given.index.target_mm, rig.screen, source))
+        warn([*target_warnings(given.index.target_mm, rig.screen, source), *convention_warnings(given, rig, source)])
     try:
         with np.errstate(all="ignore"), undetermined_to(warn, source):
             fitted = estimator.fit(used, rig)

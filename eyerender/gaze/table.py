@@ -215,17 +215,18 @@ class _Table:
 
 def _observations(table: _Table, columns: CsvColumns, rig: RigGeometry | None) -> Observations:
     parts = _parts(table, columns)
-    n = len(table)
     eye = np.concatenate([eye for _, eye in parts])
     # One entry for each part of each row.
-    line = np.tile(np.arange(n), len(parts))
+    line = np.tile(np.arange(len(table)), len(parts))
     frame, camera = _frames(table, columns, eye)[line], _cameras(table, columns, eye, rig)
     fixation, light = table.counts(columns.fixation, -1)[line], table.counts(columns.light, -1, MAX_LIGHTS - 1)[line]
     width = max(len(part.glints or ()) for part, _ in parts)
     if len(line) * width > MAX_GLINTS:
         raise InputError(f"holds more than {MAX_GLINTS} glints", source=table.source)
-    times = _times(table, columns)[line]
-    features = [_features(table, part, columns, width) for part, _ in parts]
+    features = [
+        _features(table, part, columns, width, _to_pixels(table, part, columns, rig, one))
+        for (part, _), one in zip(parts, np.split(camera, len(parts)), strict=True)
+    ]
     values = {key: np.concatenate([part[key] for part in features]) for key in features[0]}
     values["target"] = _targets(table, columns, None if rig is None else rig.screen)[line]
     table.problems.check()
@@ -258,7 +259,7 @@ def _observations(table: _Table, columns: CsvColumns, rig: RigGeometry | None) -
             camera=rows[:, 1],
             head=np.zeros(len(rows), np.int64),
             eye=rows[:, 2],
-            time_s=times[first],
+            time_s=_times(table, columns)[line][first],
             target_mm=found["target"],
             head_mm=head,
             eye_position_mm=position,
@@ -327,7 +328,9 @@ def _frames(table: _Table, columns: CsvColumns, eye: Ints) -> Ints:
     return np.arange(len(table))
 
 
-def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) -> dict[str, Floats]:
+def _features(
+    table: _Table, part: EyeColumns, columns: CsvColumns, width: int, to_pixels: tuple[Floats, Floats]
+) -> dict[str, Floats]:
     """Return one eye's numbers in each row: pupil centre (n, 2), axes and angle (n, 3), glints (n, width, 2), ..."""
     shape = np.full((len(table), 3), np.nan)
     if part.pupil_axes is not None:
@@ -344,11 +347,12 @@ def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) 
         for k in np.flatnonzero((shape[:, :2] < 0).any(axis=1)).tolist():
             table.refuse(k, part.pupil_diameter or ", ".join(part.pupil_axes or ()), "must be > 0")
         shape[(shape[:, :2] == 0).any(axis=1)] = np.nan
+    scale, shift = to_pixels
     glints = np.full((len(table), width, 2), np.nan)
     for k, pair in enumerate(part.glints or ()):
-        glints[:, k] = table.several(pair, 2) + columns.offset_px
+        glints[:, k] = table.several(pair, 2) * scale + shift
     return {
-        "pupil": table.several(part.pupil, 2) + columns.offset_px,
+        "pupil": table.several(part.pupil, 2) * scale + shift,
         "shape": shape,
         "glints": glints,
         # Rows of single glints may each repeat a confidence of their own.
@@ -359,6 +363,29 @@ def _features(table: _Table, part: EyeColumns, columns: CsvColumns, width: int) 
     }
 
 
+def _to_pixels(
+    table: _Table, part: EyeColumns, columns: CsvColumns, rig: RigGeometry | None, camera: Ints
+) -> tuple[Floats, Floats]:
+    """Return scale and shift (n, 2) that convert the places of features in a table to pixels."""
+    is_share = (columns.pupil_unit or _unit_of((part.pupil or ("",))[0])) == "fraction"
+    is_up = columns.pupil_origin == "bottom-left"
+    if rig is None and (is_share or is_up):
+        table.problems.add("pupils as fractions, or from the bottom left, need a rig", ", ".join(part.pupil or ()))
+    sizes = np.array([(1, 1)] if rig is None else [one.resolution_px for one in rig.cameras])
+    size = sizes[camera % len(sizes)].astype(float)
+    scale = size.copy() if is_share else np.ones_like(size)
+    shift = np.zeros_like(size) - (0.5 if is_share else 0.0)  # the centre of the first pixel is at 0
+    if is_up:
+        scale[:, 1], shift[:, 1] = -scale[:, 1], size[:, 1] - 1.0 - shift[:, 1]
+    return scale, shift + columns.offset_px
+
+
+def _unit_of(name: str) -> str | None:
+    """Return the unit that the name of a column ends with."""
+    said = re.search(r"(?i)[^a-z](px|pixels?|mm|norm|fraction|normali[sz]ed|deg|degrees)[^a-z]*$", name)
+    return {"p": "px", "m": "mm", "d": "deg"}.get(said[1][0].lower(), "fraction") if said else None
+
+
 def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> Floats:
     """Return the target of each row (n, 3) mm in the world, NaN where there is none."""
     names = columns.target
@@ -367,22 +394,26 @@ def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> 
     found = table.several(names, len(names))
     if len(names) == 3:
         return found
-    said = re.search(r"(?i)[^a-z](px|pixels?|mm|norm|fraction|normali[sz]ed)[^a-z]*$", names[0])
-    unit = columns.target_unit or ({"p": "px", "m": "mm"}.get(said[1][0].lower(), "fraction") if said else None)
+    unit = columns.target_unit or _unit_of(names[0])
     problem = None
     if unit is None:
-        problem = "the unit is not known; say 'target_unit' (mm, px or fraction) in --columns, or add _mm or _px"
+        problem = "the unit is not known; say 'target_unit' (mm, px, deg, ...) in --columns, or add _mm or _px"
     elif screen is None:
         problem = "targets on the screen need a rig with a screen"
     elif unit == "px" and columns.screen_px is None:
         problem = "targets in px need 'screen_px' (width and height of the screen in px) in --columns"
+    elif unit == "fraction" and columns.target_unit is None and (found < -0.2).any():
+        problem = "holds negative numbers; say 'target_unit': norm (-1 to 1 from the centre), or fraction"
     if problem is not None or unit is None or screen is None:
         table.problems.add(str(problem), ", ".join(names))
         return np.full((len(table), 3), np.nan)
     size = np.array(screen.size_mm)
-    scale = {"mm": np.ones(2), "px": size / np.array(columns.screen_px or (1, 1)), "fraction": size}[unit]
-    origin = columns.target_origin or ("centre" if unit == "mm" else "top-left")
-    at = found * scale
+    shares = {"fraction": size, "norm": size / 2, "height": size[1], "px": size / np.array(columns.screen_px or (1, 1))}
+    origin = columns.target_origin or ("top-left" if unit in ("px", "fraction") else "centre")
+    # Degrees are those at the world's origin, between the eyes, or at the eyes that keep still.
+    eye = np.mean(list(columns.eye_position_mm.values()) or [np.zeros(3)], axis=0)
+    at = np.tan(np.radians(found)) * abs((eye - screen.centre_mm) @ screen.normal) if unit == "deg" else found
+    at = at * shares.get(unit, 1.0)
     if origin != "centre":
         at = at - size / 2
     if origin == "top-left":

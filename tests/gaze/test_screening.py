@@ -86,4 +86,5 @@ def test_a_calibration_that_misses_its_own_targets_warns(scene, clean):
     turned = clean.with_targets(clean.index.target_mm[::-1])
     told: list[InputWarning] = []
     fit_estimator(choose_estimator("guestrin-eizenman"), turned, scene.rig, warn=told.extend)
-    assert [warning.code for warning in told] == ["misfit"]
+    assert [warning.code for warning in told] == ["convention", "misfit"]
+    assert told[0].path == "pupil_origin"
