@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...base.arrays import Bools, Floats
 from ...folders.imagefolder import ImageEntry
 from ...imaging.labels import moments_ellipse
-from ...rig.camera import Window
+from ...rig.camera import Window, undistort
 from ...scene.parts import FRAME, IRIS, PUPIL
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 from .problems import differences
@@ -86,8 +86,8 @@ def _geometry(entry: ImageEntry, mask: Mask | None) -> Iterator[str]:
     if depth is not None and np.nanmin(depth, initial=1.0) <= 0:
         yield "its depth holds values <= 0"
     if normals is not None:
-        length = np.linalg.norm(normals, axis=2)
-        if np.nanmax(np.abs(length - 1), initial=0.0) > _UNIT or np.nanmax(normals[..., 2], initial=-1.0) > _FACING:
+        length, away = np.linalg.norm(normals, axis=2), np.sum(normals * _rays(entry), axis=2)
+        if np.nanmax(np.abs(length - 1), initial=0.0) > _UNIT or np.nanmax(away, initial=-1.0) > _FACING:
             yield "its normals are no unit vectors to the camera"
     if instances is None:
         return
@@ -101,6 +101,16 @@ def _geometry(entry: ImageEntry, mask: Mask | None) -> Iterator[str]:
     ):
         if values is not None and np.any(np.isnan(values if values.ndim == 2 else values[..., 0]) == there):
             yield f"its {name} are not where its mask of instances says"
+
+
+def _rays(entry: ImageEntry) -> Floats:
+    """Compute unit directions (h, w, 3) out of the camera through the pixels, in the frame of its normals."""
+    (x0, y0, w, h), camera = entry.window, entry.line["labels"]["camera"]
+    K = np.array(camera["K"], dtype=float)
+    v, u = np.mgrid[y0 : y0 + h, x0 : x0 + w].astype(float)
+    x, y = undistort((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.array(camera["distortion"], dtype=float))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:
