@@ -238,12 +238,12 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 85655,  # what a dataset teaches by mistake, for those who train on it: dependences, shares, missing labels
+    "": 86900,  # what datasets teach by mistake, for those who train; files of other programs, for those who have films
     "analytic": 730,
     "apps": 16425,  # dependences that teach a network something false, missing labels, for those who make data
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
-    "cli": 2560,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
+    "cli": 2600,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
     "dataset": 10040,  # growth that keeps old images readable; rounding of processors recorded; for long runs
     "design": 2810,
     "extraction": 7150,
