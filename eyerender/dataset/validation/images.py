@@ -211,7 +211,7 @@ def iris_outline(line: dict[str, Any], limbus_px: Floats | None) -> Outline | No
     if limbus_px is not None:
         return Outline(limbus_px, EXACT_PX)
     own = line.get("labels", {}).get("iris")
-    if not isinstance(own, dict) or own["amodal"]["status"] != "ok" or own["amodal"]["rim_hidden"]:
+    if not isinstance(own, dict) or own["amodal"]["status"] != "ok" or own["amodal"].get("rim_hidden"):
         return None
     return _ellipse(own["amodal"], LIMBUS_PX)
 
