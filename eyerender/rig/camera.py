@@ -439,6 +439,23 @@ class PinholeCamera(ArrayValue):
         """Return whether the distortion is invertible at normalised coordinates x = X/Z, y = Y/Z (not folded back)."""
         return np.asarray(is_imaged(self.across * x, y, self.distortion))
 
+    @property
+    def fold(self) -> tuple[float, float]:
+        """Radius at which a radial distortion folds the image back, without and with it; inf if it does not fold."""
+        k1, k2, _, _, k3 = self.distortion
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+        r2 = float(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)].min(initial=np.inf))
+        return (r2**0.5, r2**0.5 * (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))) if r2 < np.inf else (np.inf, np.inf)
+
+    def without_rays(self, window: Window) -> Bools | None:
+        """Return which pixels (h, w) of a window lie beyond the fold of the lens; None if none does."""
+        reach, (x0, y0, width, height) = self.fold[1], window
+        x = (np.arange(x0, x0 + width) - self.K[0, 2]) / self.K[0, 0]
+        y = (np.arange(y0, y0 + height) - self.K[1, 2]) / self.K[1, 1]
+        if np.hypot(np.abs(x).max(), np.abs(y).max()) <= reach:
+            return None
+        return np.asarray(np.hypot(x[None, :], y[:, None]) > reach)
+
     def in_image(self, pixels: ArrayLike) -> Bools:
         """Return whether pixels (..., 2) lie on the sensor, which ends half a pixel beyond its outer pixel centres."""
         return in_window((0, 0, *self.resolution_px), pixels)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import Floats
-from ..base.errors import InputWarning
+from ..base.errors import InputError, InputWarning
 from .camera import Camera, PinholeCamera, Window, serves
 from .light import Lamp
 from .rig import RigGeometry
@@ -46,6 +46,7 @@ _BEHIND_MM = 1.0
 # Points of an eye that may be in view: the corneal apex and points of the limbus, within what rotation of the eye
 # moves.
 _LIMBUS_MM = np.array([[0, 0, 0], [-3, 6, 0], [-3, -6, 0], [-3, 0, 6], [-3, 0, -6]], dtype=float)
+_PUPIL_REACH_MM = np.array([[0, 0, 0], [0, 4, 0], [0, -4, 0], [0, 0, 4], [0, 0, -4]], dtype=float)
 # A camera that is farther than this from an eye's axis sees no cornea in any pose of the eye.
 _FURTHEST_RAD = np.radians(140.0)
 
@@ -168,6 +169,30 @@ def view_warnings(
     blind = [c for c, shown in seen.items() if shown and not any(shown)]
     everywhere = "; nothing of any eye is in view" if len(blind) == len(rig.cameras) else ""
     return [InputWarning(code="out-of-view", reason=f"sees no eye{everywhere}", path=camera_paths[c]) for c in blind]
+
+
+def fold_warnings(
+    rig: RigGeometry, views: Mapping[int, Iterable[tuple[Window, Floats]]], camera_paths: Sequence[str]
+) -> list[InputWarning]:
+    """Warn of lenses that fold the image back inside a window; `views` and `camera_paths` as for `view_warnings`.
+
+    Raises:
+        InputError: a pupil, or a whole window, lies beyond the fold.
+    """
+    found = []
+    for c, camera in enumerate(rig.cameras):
+        dark = [camera.without_rays(window) for window, _ in views[c]]
+        reach, limit = camera.fold
+        apexes = np.array([apex + _PUPIL_REACH_MM for _, apex in views[c]]).reshape(-1, 3)
+        seen = apexes @ camera.R.T + camera.t
+        outside = (np.hypot(seen[:, 0], seen[:, 1]) > reach * np.abs(seen[:, 2])) & (seen[:, 2] > 0)
+        reason = f"folds the picture back {limit * camera.K[0, 0]:.0f} px from the principal point; "
+        if outside.any() or any(one is not None and one.all() for one in dark):
+            raise InputError(f"{reason}an eye lies beyond", path=camera_paths[c])
+        if any(one is not None for one in dark):
+            reason += "pixels beyond are black, and class 4 of masks"
+            found.append(InputWarning(code="fold", reason=reason, path=camera_paths[c]))
+    return found
 
 
 EXPOSURE_REMEDY = (

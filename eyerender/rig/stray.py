@@ -234,13 +234,15 @@ def _cosines(n: int, count: int, dtype: np.dtype[Any]) -> Reals:
 
 
 def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -> Bools | None:
-    """Return which pixels (h, w) of a window show no eye: those that openings cover by more than half, and the border.
+    """Return which pixels (h, w) of a window show no eye: half covered by openings, on the border, or without a ray.
 
-    None if there are neither openings nor a border.
+    None if there are no such pixels.
     """
+    beyond = camera.without_rays(window)
     if not lens.openings and not any(sensor.border_px):
-        return None
-    return _covered(lens.openings, sensor.border_px, tuple(camera.resolution_px), tuple(window))
+        return beyond
+    found = _covered(lens.openings, sensor.border_px, tuple(camera.resolution_px), tuple(window))
+    return found if beyond is None else found | beyond
 
 
 @lru_cache(maxsize=8)  # it is the same in every frame of a camera

@@ -40,6 +40,7 @@ from ..rig.exposure import automatic_exposure, iris_radiance
 from ..rig.imaging import Ambient
 from ..rig.light import Lamp
 from ..rig.plausibility import (
+    fold_warnings,
     length_warnings,
     mirror_warnings,
     place_warnings,
@@ -246,6 +247,7 @@ class Scene:
         try:
             for side in EYES if self.spec.person is not None else EYES[:1]:
                 self.eye(side)
+            self._fold_warnings()
             for file in self.files if self.base is not None else ():
                 if not os.path.isfile(file):
                     raise InputError("no such file", source=str(file))
@@ -408,9 +410,6 @@ class Scene:
             for i, light in enumerate(spec.rig.lights)
             for _ in range(1 if light.ring is None else light.ring.count)
         ]
-        views: dict[int, list[tuple[Window, Floats]]] = {c: [] for c in range(len(rig.cameras))}
-        for (c, k, side), window in self.windows().items():
-            views[c].append((window, self.eye_position_mm(EYES[side]) + positions[k]))
         pupil = "eye.pupil_diameter_mm" if spec.eye.pupil_diameter_mm is not None else "eye.model"
         found = [
             *pupil_warnings(self.pupil_diameter_mm, pupil),
@@ -419,9 +418,24 @@ class Scene:
             *place_warnings(rig, eyes, heads, cameras, lights),
             *mirror_warnings(spec.rig.cameras, eyes),
             *self._face_warnings([*zip(cameras, rig.cameras, strict=True)], [*zip(lights, rig.lights, strict=True)]),
-            *view_warnings(rig, views, [f"rig.cameras.{i}" for i in range(len(rig.cameras))]),
+            *view_warnings(rig, self._views(), [f"rig.cameras.{i}" for i in range(len(rig.cameras))]),
+            *self._fold_warnings(),
         ]
         return [warning.at(self.source) for warning in found]
+
+    def _views(self) -> dict[int, list[tuple[Window, Floats]]]:
+        """Return the windows of each camera, each with the corneal apex that it shows."""
+        views: dict[int, list[tuple[Window, Floats]]] = {c: [] for c in range(len(self.rig.cameras))}
+        for (c, k, side), window in self.windows().items():
+            head = np.array(self.spec.subject.head_positions_mm[k])
+            views[c].append((window, self.eye_position_mm(EYES[side]) + head))
+        return views
+
+    def _fold_warnings(self) -> list[InputWarning]:
+        if all(camera.fold[0] == np.inf for camera in self.rig.cameras):
+            return []
+        paths = [f"rig.cameras.{i}.distortion" for i in range(len(self.rig.cameras))]
+        return fold_warnings(self.rig, self._views(), paths)
 
     def _face_warnings(
         self, cameras: list[tuple[str, PinholeCamera]], lights: list[tuple[str, Lamp]]

@@ -147,6 +147,9 @@ class RawFrame(ArrayValue):
             picture = stray.scattered(picture, *seen)
         else:
             picture = stray.scattered_around(picture, self._around(self.around, exposed.glints), *seen)
+        beyond = job.camera.without_rays(job.window)
+        if beyond is not None:
+            picture = np.where(beyond, np.float32(0), picture)
         return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
 
     def _around(self, cells: Singles, glints: Sequence[Shine]) -> Singles:
