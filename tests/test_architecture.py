@@ -248,7 +248,7 @@ BOUNDS = {
     "design": 2810,
     "extraction": 7150,
     "eye": 3220,
-    "folders": 1780,  # the reader of videos, for benchmarks; what is missing of cut and damaged ones, for their owners
+    "folders": 1840,  # videos: what is missing of damaged ones; files of other programs named, for their owners
     "gaze": 5080,  # calibrations that survive blinks; tables of other trackers, compared with the rig, for their users
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,

@@ -21,6 +21,7 @@ from PIL import Image
 from ..base.arrays import Bytes, Singles
 from ..base.errors import InputError
 from ..base.storage.files import opened, written
+from .foreign import foreign_kind
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".gif", ".webp", ".jp2")  # suffixes of images
 MAX_FILES = 1_000_000
@@ -208,7 +209,8 @@ def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDA
         raise InputError("needs more memory than is available", source=source) from None
     except Exception:
         # Pillow's decoders may raise any exception for a damaged file.
-        raise InputError("is not a readable image", source=source) from None
+        data.seek(0)
+        raise InputError(foreign_kind(data.read(512)) or "is not a readable image", source=source) from None
 
 
 def _is_followed(data: BinaryIO, file: Image.Image) -> bool:

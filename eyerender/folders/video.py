@@ -22,10 +22,11 @@ from ..base.errors import InputError, InputWarning
 from ..base.spec import file_digest
 from ..base.storage.cachefolder import cache_folder
 from ..base.storage.files import opened
+from .foreign import foreign_kind
 from .imagefile import MAX_PIXELS, write_png
 
 MAX_IMAGES = 100_000
-SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
+SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ts", ".y4m")
 MAX_VIDEO_BYTES = 1 << 40
 # FFmpeg's demuxer for each accepted kind of file, by its first bytes. FFmpeg itself would also choose demuxers of
 # scripts and playlists, which open other files.
@@ -37,6 +38,7 @@ _READERS = (
     (re.compile(rb"\x00\x00\x01\xb3"), "mpegvideo"),
     (re.compile(rb"G.{187}G.{187}G", re.DOTALL), "mpegts"),
     (re.compile(rb"0&\xb2u\x8ef\xcf\x11\xa6\xd9\x00\xaa\x00b\xcel"), "asf"),  # WMV
+    (re.compile(rb"YUV4MPEG2 "), "yuv4mpegpipe"),
 )
 _HEAD_BYTES = 512
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
@@ -60,8 +62,26 @@ class VideoFrame:
 
 
 def is_video(path: str | Path) -> bool:
-    """Return whether a file name has the suffix of a video."""
-    return Path(path).suffix.lower() in SUFFIXES
+    """Return whether a file has the suffix of a video or, if it can be read, begins like one."""
+    try:
+        return Path(path).suffix.lower() in SUFFIXES or _reader_of(path) is not None
+    except InputError:
+        return False
+
+
+def _reader_of(path: str | Path) -> str | None:
+    """Return FFmpeg's demuxer of a video; None for other files.
+
+    Raises:
+        InputError: the file is empty, another kind than a video, or cannot be opened.
+    """
+    with opened(path, limit=MAX_VIDEO_BYTES) as file:  # a missing file, a folder or a pipe has its own message
+        head = file.read(_HEAD_BYTES)
+    if not head:
+        raise InputError("is empty", source=str(path))
+    if (known := foreign_kind(head)) is not None:
+        raise InputError(known, source=str(path))
+    return next((name for pattern, name in _READERS if pattern.match(head)), None)
 
 
 class VideoReader:
@@ -81,11 +101,7 @@ class VideoReader:
 
     def __init__(self, path: str | Path) -> None:
         self.source = str(path)
-        with opened(path, limit=MAX_VIDEO_BYTES) as file:  # a missing file, a folder or a pipe has its own message
-            head = file.read(_HEAD_BYTES)
-        if not head:
-            raise InputError("is empty", source=self.source)
-        reader = next((name for pattern, name in _READERS if pattern.match(head)), None)
+        reader = _reader_of(path)
         if reader is None:
             raise InputError(f"is not a video ({', '.join(SUFFIXES)})", source=self.source)
         self._capture = _capture(os.path.abspath(path), reader)
@@ -100,6 +116,8 @@ class VideoReader:
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.count = int(count) if 0 < count < 1e9 else 0
 
+        code = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin-1")
+        self._codec = f" (codec {code})" if code.isalnum() else ""
         self.gaps: list[tuple[int, int]] = []
         self.read = 0
         self._last = VideoFrame(-1, -1.0 / self.frames_per_s, np.zeros((0, 0), np.uint8), False)
@@ -129,7 +147,10 @@ class VideoReader:
             yield self._last
         self._capture.release()
         if self.read == 0:
-            raise InputError("holds no frame that can be read", source=self.source)
+            raise InputError(
+                f"holds no frame that can be read{self._codec}; try ffmpeg -i FILE -c:v ffv1 OUT.mkv",
+                source=self.source,
+            )
 
     def _number(self, time_s: float, failures: int) -> int:
         """Return the number of a frame that was read after some failures: by its time, or by its place in an AVI.

@@ -14,7 +14,8 @@ from pydantic import ConfigDict, Field, model_validator
 from ..base.arrays import frozen
 from ..base.errors import InputError, Problems
 from ..base.spec import EYES, FileSpec, Positive, Spec, Vec3, read_yaml
-from ..base.storage.files import parse_json, read_text
+from ..base.storage.files import opened, parse_json, read_text
+from ..folders.foreign import not_records
 from ..rig.camera import CameraCalibration, EyeNames, PinholeCamera
 from ..rig.light import MAX_LIGHTS, Lamp
 from ..rig.rig import MAX_CAMERAS, Rig, RigGeometry, RigLike
@@ -59,6 +60,10 @@ def load_observations(
         InputError: naming the file and the key.
     """
     source = str(path)
+    with opened(path, limit=MAX_RECORDS_BYTES) as file:
+        known = not_records(file.read(512))
+    if known is not None:
+        raise InputError(known, source=source)
     if scene is not None and rig is not None:
         raise InputError("give either a scene or a rig", source="--rig")
     given: RigGeometry | None = None

@@ -338,7 +338,7 @@ def test_all_errors_of_an_input_have_a_line_each(place, capsys):
     assert err.splitlines() == [
         "error: t.csv: line 3.pupil_x: must be a number or empty, not 'y'",
         "error: t.csv: line 2.pupil_y: must be a number or empty, not 'x'",
-        "error: t.csv: target_x, target_y: the unit is not known; say 'target_unit' (mm, px or fraction) in --columns, "
+        "error: t.csv: target_x, target_y: the unit is not known; say 'target_unit' (mm, px, deg, ...) in --columns, "
         "or add _mm or _px",
     ]
     assert not Path("c.json").exists()
