@@ -249,11 +249,11 @@ BOUNDS = {
     "extraction": 7150,
     "eye": 3220,
     "folders": 1840,  # videos: what is missing of damaged ones; files of other programs named, for their owners
-    "gaze": 5080,  # calibrations that survive blinks; tables of other trackers, compared with the rig, for their users
+    "gaze": 5110,  # calibrations that survive blinks; tables of other trackers, compared with the rig, for their users
     "imaging": 2260,  # one line of metadata for all folders; eyes of cameras
     "optics": 5180,
     "population": 2520,
-    "region": 4100,  # heads from STL and GLB files of any tool, with all mistakes named at once
+    "region": 4110,  # heads from STL and GLB files of any tool, with all mistakes named at once
     "rendering": 12520,
     "report": 970,
     "rig": 3300,  # headsets; exposure set by lights; calibration files of any writer, and lenses that fold, for owners

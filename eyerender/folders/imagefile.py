@@ -220,7 +220,7 @@ def _is_followed(data: BinaryIO, file: Image.Image) -> bool:
     content = data.read()
     data.seek(place)
     if file.format == "PPM" and content.startswith(b"P5"):
-        end = file.tile[0][2] + file.width * file.height * (1 if file.mode == "L" else 2)
+        end = file.tile[0][2] + file.width * file.height * (1 if file.mode == "L" else 2)  # type: ignore[attr-defined]
         return content[end:].lstrip().startswith(b"P5")
     return _FOLLOWED.search(content) is not None
 

@@ -160,7 +160,7 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
 
 def _plausible(place: Floats, rig: RigGeometry) -> Bools:
     """Return whether estimated places (n, 3) mm can be those of eyes: 10 mm to 3 m in front of every camera."""
-    ok: Bools = np.isfinite(place).all(axis=1)
+    ok: Bools = np.asarray(np.isfinite(place).all(axis=1))
     for camera in rig.cameras:
         away = place - camera.nodal_point_mm
         ok = np.asarray(ok & (np.abs(np.linalg.norm(away, axis=1) - 1505.0) < 1495.0))

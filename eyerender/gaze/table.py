@@ -411,7 +411,7 @@ def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> 
     shares = {"fraction": size, "norm": size / 2, "height": size[1], "px": size / np.array(columns.screen_px or (1, 1))}
     origin = columns.target_origin or ("top-left" if unit in ("px", "fraction") else "centre")
     # Degrees are those at the world's origin, between the eyes, or at the eyes that keep still.
-    eye = np.mean(list(columns.eye_position_mm.values()) or [np.zeros(3)], axis=0)
+    eye = np.mean(list(columns.eye_position_mm.values()) or [(0.0, 0.0, 0.0)], axis=0)
     at = np.tan(np.radians(found)) * abs((eye - screen.centre_mm) @ screen.normal) if unit == "deg" else found
     at = at * shares.get(unit, 1.0)
     if origin != "centre":

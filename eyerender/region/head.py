@@ -108,8 +108,12 @@ def _all_objects(spec: Head, problems: Problems) -> dict[str, list[trimesh.Trime
             problems.add("does not have the given sha256", Path(file).name)
     objects: dict[str, list[trimesh.Trimesh]] = {}
     for file in spec.files:
-        for name, mesh in read_objects(Path(file)):
-            objects.setdefault(name, []).append(mesh)
+        try:
+            for name, mesh in read_objects(Path(file)):
+                objects.setdefault(name, []).append(mesh)
+        except InputError:
+            problems.check()  # another file than was meant is not the reader's to explain
+            raise
     return objects
 
 

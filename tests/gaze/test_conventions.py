@@ -36,7 +36,7 @@ def table(path, name, how="", targets="mm"):
         writer.writerow(header)
         for i in range(len(seen)):
             eye, camera = int(seen.index.eye[i]), scene.rig.cameras[max(int(seen.index.camera[i]), 0)]
-            spots = [place(*one, camera, how) for one in [seen.pupil.centre_px[i], *seen.glints.xy_px[i]]]
+            spots = [place(one[0], one[1], camera, how) for one in [seen.pupil.centre_px[i], *seen.glints.xy_px[i]]]
             if how == "lights":
                 spots[1:] = spots[:0:-1]
             x, y = screen.flat(seen.index.target_mm[i])
