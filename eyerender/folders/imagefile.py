@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import warnings
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +35,6 @@ FORMATS = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "GIF", "WEBP", "JPEG2000")
 COLOURED = ("RGB", "RGBA", "P", "PA", "LA", "La", "RGBa", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
 
 
-# The end of a PNG or JPEG image, and the begin of another one.
-_FOLLOWED = re.compile(rb"IEND\xaeB`\x82\s*\x89PNG\r\n|\xff\xd9\s*\xff\xd8\xff")
 _WAITING = 8  # images of a `Writer`
 
 
@@ -215,14 +212,19 @@ def _image(data: BinaryIO, size: int, source: str, *, colour: bool) -> tuple[NDA
 
 def _is_followed(data: BinaryIO, file: Image.Image) -> bool:
     """Return whether another image follows the first one in a PNG, JPEG or binary PGM file, where Pillow stops."""
+    if file.format not in ("PNG", "JPEG", "PPM"):
+        return False
     place = data.tell()
     data.seek(0)
     content = data.read()
     data.seek(place)
-    if file.format == "PPM" and content.startswith(b"P5"):
-        end = file.tile[0][2] + file.width * file.height * (1 if file.mode == "L" else 2)  # type: ignore[attr-defined]
-        return content[end:].lstrip().startswith(b"P5")
-    return _FOLLOWED.search(content) is not None
+    if file.format == "JPEG":
+        return b"\xff\xd9\xff\xd8\xff" in content
+    if file.format == "PNG":
+        return content.partition(b"IEND\xaeB`\x82")[2].lstrip().startswith(b"\x89PNG")
+    start = int(cast("Any", file).tile[0][2])
+    size = file.width * file.height * (1 if file.mode == "L" else 2)
+    return content.startswith(b"P5") and content[start + size :].lstrip().startswith(b"P5")
 
 
 def _decoded(file: Image.Image, source: str, colour: bool, is_followed: bool) -> tuple[NDArray[Any], int, bool]:

@@ -47,7 +47,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 _ATTEMPTS = 100  # failed reads in a row after which a video ends
 _MOST_GAPS = 3  # of a message
-_MOST_CHUNKS, _MOST_INDEX_BYTES = 32, 1 << 26
+_MOST_CHUNKS, _MOST_INDEX_BYTES = 32, 1 << 24  # a million frames
 _TINT = 8  # levels between channels that lossy codecs leave in grey images
 
 

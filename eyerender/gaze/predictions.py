@@ -159,12 +159,9 @@ def _eye_places(estimator: GazeEstimator, observations: Observations, rig: RigGe
 
 
 def _plausible(place: Floats, rig: RigGeometry) -> Bools:
-    """Return whether estimated places (n, 3) mm can be those of eyes: 10 mm to 3 m in front of every camera."""
-    ok: Bools = np.asarray(np.isfinite(place).all(axis=1))
-    for camera in rig.cameras:
-        away = place - camera.nodal_point_mm
-        ok = np.asarray(ok & (np.abs(np.linalg.norm(away, axis=1) - 1505.0) < 1495.0))
-    return ok
+    """Return whether estimated places (n, 3) mm can be those of eyes: 10 mm to 3 m from every camera."""
+    away = np.array([np.linalg.norm(place - camera.nodal_point_mm, axis=1) for camera in rig.cameras])
+    return np.asarray(((away > 10.0) & (away < 3000.0)).all(axis=0))
 
 
 def _screen_angles(point_mm: Floats, eye_mm: Floats, screen: ScreenPlane | None) -> Floats:
