@@ -143,6 +143,12 @@ def _opencv_yaml_seeds() -> list[bytes]:
     return [f"%YAML:1.0\n---\n{text}distortion_coefficients: {_matrix(1, 5, [0.1, 0.0, 0.0, 0.0, 0.0])}".encode()]
 
 
+def _opencv_npz_seeds() -> list[bytes]:
+    file = BytesIO()
+    np.savez(file, mtx=np.diag([800.0, 800.0, 1.0]), dist=np.zeros((1, 5)), ret=0.3, imageSize=[640, 480])
+    return [file.getvalue()]
+
+
 def _opencv_xml_seeds() -> list[bytes]:
     matrix = '<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt><data>800. 0. 320. 0. 800. '
     size = "<image_width>640</image_width><image_height>480</image_height>"
@@ -310,6 +316,7 @@ READERS: dict[str, Reader] = {
     "npy": Reader("a.npy", _map, _npy_seeds),
     "opencv-yaml": Reader("a.yaml", _opencv, _opencv_yaml_seeds),
     "opencv-xml": Reader("a.xml", _opencv, _opencv_xml_seeds),
+    "opencv-npz": Reader("a.npz", _opencv, _opencv_npz_seeds),
     "topography-points": Reader("a.csv", _topography("points"), _points_seeds),
     "topography-matrix": Reader("a.csv", _topography("matrix"), _matrix_seeds),
     "ply": Reader("a.ply", _head, _mesh("ply")),
