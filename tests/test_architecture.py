@@ -53,6 +53,7 @@ BASE = [
     "status",
     "storage",
     "arguments",
+    "apart",
     "jit",
     "references",
     "spec",

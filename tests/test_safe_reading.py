@@ -24,6 +24,7 @@ EXCEPTIONS = {
     "base.storage.files.opened: open": "the opener itself",
     "base.storage.files.appended: open": "the opener itself",
     "base.storage.files._sync: os.open": "to sync a file or folder, not to read it",
+    "base.apart.imported_apart: os.open": "the current folder, to come back to it",
     "base.storage.lock._take: os.open": "a lock, not a link, whose content is not used",
     "base.jit._folder: source.read_bytes": "this package's sources",
     "region.mapcache._code: path.read_bytes": "this package's sources",

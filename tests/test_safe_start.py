@@ -61,6 +61,28 @@ def test_only_one_module_names_the_interpreter_to_run():
     assert found == []
 
 
+def test_settings_of_libraries_in_the_current_folder_are_not_read(tmp_path):
+    precious = tmp_path / "precious.txt"
+    precious.write_text("mine", encoding="utf-8")
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    # numba would empty the file, and import any module; matplotlib would wait for the pipe.
+    (folder / ".numba_config.yaml").write_text(f"chrome_trace: {precious}\ndisable_jit: 1\n", encoding="utf-8")
+    os.mkfifo(folder / "matplotlibrc")
+    script = (
+        "import os\n"
+        "from eyerender.base.jit import config\n"
+        "from eyerender.report.style import figure\n"
+        "with figure(1, 1): print(config.DISABLE_JIT, os.getcwd())\n"
+        "from numba.core.config import reload_config; reload_config(); print(config.DISABLE_JIT)\n"
+    )
+    argv = [sys.executable, "-P", "-c", script]
+    env = {**os.environ, "PYTHONPATH": str(PACKAGE.parent)}
+    done = subprocess.run(argv, cwd=folder, capture_output=True, text=True, timeout=60, check=True, env=env)
+    assert done.stdout.split() == ["0", str(folder), "0"]
+    assert precious.read_text(encoding="utf-8") == "mine"
+
+
 @pytest.fixture
 def theirs(tmp_path):
     """A folder with modules of standard names, which leave a mark when they run."""

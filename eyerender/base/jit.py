@@ -27,8 +27,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
-import numba
 import numpy as np
+
+from .apart import imported_apart
+
+imported_apart("numba", ".numba_config.yaml")
+import numba
 from numba.core import config as numba_config
 from numba.core import sigutils
 from numba.core.dispatcher import Dispatcher
@@ -39,6 +43,7 @@ from .storage.cachefolder import cache_folder
 Function = TypeVar("Function", bound=Callable[..., Any])
 _DIGITS, _UNUSED_S = 16, 30 * 86400.0
 config: Any = numba_config  # it makes its attributes at run time
+config._config_fname = os.devnull  # otherwise it reads the current folder's file again whenever it compiles
 normalize_signature: Any = sigutils.normalize_signature  # it has no types
 njit: Any = numba.njit  # its types lack some options
 

@@ -90,11 +90,12 @@ def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> N
 def _staged(folder: Path, place: Path, shard: int) -> Staged:
     """Copy a verified shard into a temporary folder, for `commit` to put in place."""
     stage, done = new_stage(folder, shard), read_done(place, shard)
+    for name in done["files"]:
+        if name.count("/") != 2:
+            raise InputError("does not lie in a folder of the shard", source=str(place / name))
     for name, entry in done["files"].items():
         kind, _, file = name.split("/", 2)
         source, own = inside(place, name), stage / (SHARD if kind == SHARDS else kind) / file
-        if "/" in file:
-            raise InputError("does not lie in a folder of the shard", source=str(source))
         make_folder(own.parent)
         with opened(source, follow=False) as read, open(own, "xb") as write:
             shutil.copyfileobj(read, write)

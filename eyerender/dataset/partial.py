@@ -232,7 +232,9 @@ class PartialShard:
         self.made = {line["sample"] for line, _ in kept} | set(self._given_up)
         for kind in self.plan.spec.labels.pictures:
             for path in (self.stage / kind).iterdir():
-                if self._place(kind, path.name) not in self._files:
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                elif self._place(kind, path.name) not in self._files:
                     path.unlink()
 
     def _intact_lines(self, done: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], bytes]]:
@@ -270,7 +272,8 @@ def stages(folder: Path) -> Iterator[tuple[int, Path]]:
     """Return the unfinished shards in a folder, with their temporary folders."""
     for stage in sorted(folder.glob(f"{STAGE}*-*")):
         number = stage.name.removeprefix(STAGE).split("-")[0]
-        if number.isdecimal() and stage.is_dir() and not stage.is_symlink():
+        own = (stage, *(stage / name for name in (*KINDS, SHARD, DONE)))
+        if number.isdecimal() and stage.is_dir() and not any(map(os.path.islink, own)):
             yield int(number), stage
 
 

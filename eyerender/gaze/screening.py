@@ -68,7 +68,8 @@ def _misfits(angles: Floats, places: Floats, pupils: Floats) -> list[tuple[int, 
     # sigma^2 * 0.86.
     deviation = float(np.sqrt(np.quantile(best**2, _SHARE / 2) / 0.86))
     kept = _nearest(best, trimmed)
-    travel = float(np.ptp(pupils[kept & np.isfinite(pupils).all(axis=1)], axis=0).max(initial=0.0))
+    seen = pupils[kept & np.isfinite(pupils).all(axis=1)]
+    travel = float(np.ptp(seen, axis=0).max()) if len(seen) else 0.0
     limit = max(_DEVIATIONS * deviation, _LEAST_PX, _TRAVEL[design.shape[1]] * travel)
     return [(int(row), float(best[row])) for row in np.flatnonzero(best > limit)]
 

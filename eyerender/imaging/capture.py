@@ -204,13 +204,16 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
     seeds = np.random.SeedSequence(
         [scene.spec.seed, int(index.instant[row]), int(index.eye[row]), *([rank] if rank else [])]
     )
+    lights = tuple(scene.rig.lights[k] for k in scene.rig.lights_of(int(index.eye[row])))
+    if not lights:
+        raise InputError(f"none lights the {side} eye; name it in `eyes` of one", path="rig.lights")
     return RenderJob(
         eye=scene.eye(side),
         M=M,
         t=t,
         camera=scene.rig.cameras[camera],
         window=scene.window(camera, head, int(index.eye[row])),
-        lights=tuple(scene.rig.lights[k] for k in scene.rig.lights_of(int(index.eye[row]))),
+        lights=lights,
         sensor=scene.spec.sensor,
         look=scene.spec.look,
         region=None if scene.region is None else scene.region.of_side(side),

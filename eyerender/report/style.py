@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.apart import imported_apart
 from ..base.arrays import Floats
 
 ANALYTIC, IMAGE, TARGET = "#0072B2", "#D55E00", "#222222"
@@ -33,7 +34,7 @@ _RC: dict[Any, Any] = {
 @contextmanager
 def figure(width: float, height: float, columns: int = 1, rows: int = 1) -> Iterator[tuple[Any, Any]]:
     """Create a matplotlib figure (inches) with `columns` by `rows` axes, in the shared style, never on a display."""
-    import matplotlib as mpl
+    mpl = imported_apart("matplotlib", "matplotlibrc")
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 

@@ -109,6 +109,32 @@ def test_a_damaged_checkpoint_or_another_plans_is_not_used(fresh, whole, tmp_pat
     assert tree(tmp_path) == tree(whole)
 
 
+@pytest.mark.parametrize("name", ["images", "masks", "shard"])
+def test_a_checkpoint_with_links_is_left_alone(fresh, whole, tmp_path, name):
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "thesis.doc").write_text("keep")
+    folder = tmp_path / "run"
+    stage = folder / ".partial-00000-x"
+    stage.mkdir(parents=True)
+    (stage / name).symlink_to(victim)
+    done = json.loads((whole / "shards" / "00000" / "done.json").read_text())
+    (stage / "done.json").write_text(json.dumps({**done, "files": {}}))
+    commit(folder, write_shard(fresh, folder, 0, lambda *_: None))
+    assert tree(folder / "images") == tree(whole / "images")
+    assert not any(place.is_symlink() for place in (folder / "images").iterdir())
+    assert [place.name for place in victim.iterdir()] == ["thesis.doc"]
+
+
+def test_folders_in_a_checkpoint_do_not_stop_a_run(fresh, whole, tmp_path):
+    stage = tmp_path / ".partial-00000-x"
+    (stage / "images" / "sub").mkdir(parents=True)
+    done = json.loads((whole / "shards" / "00000" / "done.json").read_text())
+    (stage / "done.json").write_text(json.dumps({**done, "files": {}}))
+    commit(tmp_path, write_shard(fresh, tmp_path, 0, lambda *_: None))
+    assert tree(tmp_path / "images") == tree(whole / "images")
+
+
 def test_a_killed_worker_loses_what_came_after_the_checkpoint(fresh, whole, tmp_path, monkeypatch):
     monkeypatch.setattr(partial, "CHECKPOINT_S", 0.0)
 

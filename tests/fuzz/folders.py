@@ -119,7 +119,7 @@ def _ideal_seeds() -> list[bytes]:
     pupil = {"status": "ok", "centre_px": [32, 24], "semi_axes_px": [12, 12], "angle_rad": 0.0}
     said = {"lid": False, "bit_depth": 8, "polarity": "dark", "noise_dn": 1.0, "blur_px": 1.0, "step_dn": 100.0}
     record = {"pupil": pupil, "glints": [{"light": 0, "xy_px": [30, 20], "status": "ok"}]}
-    return _jsons({"file_name": "images/00000000-right.png", "records": [record], "parameters": said})()
+    return _jsons({"file_name": "images/a.png", "records": [record], "parameters": said})()
 
 
 def _beside_ideal(folder: Path) -> None:

@@ -291,7 +291,8 @@ def appended(path: str | Path) -> BufferedRandom:
     """Open a regular file, which is not a link, for appending and reading; create it if it is missing.
 
     Raises:
-        InputError: the path is a link, or something else than a file, or cannot be opened.
+        InputError: the path is a link, or something else than a file.
+        OSError: the disk is full or not writable.
     """
     return open(_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False), "ab+")
 
@@ -304,6 +305,8 @@ def _regular(path: str | Path, flags: int, follow: bool) -> int:
         flags |= getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
         handle = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)), 0o644)
     except OSError as error:
+        if flags & os.O_CREAT and not (os.path.islink(path) or os.path.isdir(path)):  # the disk is full or not writable
+            raise
         raise InputError(_why_unreadable(path, error), source=source) from None
     except ValueError:
         raise InputError("is not a valid file name", source=source) from None
