@@ -70,6 +70,7 @@ def features(
 def extract(
     *images: Path,
     scene: str | None = None,
+    camera: int | None = None,
     gamma: float | None = None,
     method: Literal["fast", "refined"] = "refined",
     eyes: int = 1,
@@ -90,6 +91,7 @@ def extract(
     Args:
         images: Greyscale images, one folder of images, or one video.
         scene: A scene with the rig; glints are assigned to its lights and listed in their order.
+        camera: Number of the scene's camera that took the images (default: 0).
         gamma: Encoding gamma of the pixel values (default: 1, linear; 8-bit videos are mostly encoded with 2.2).
         method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit.
         eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
@@ -112,9 +114,11 @@ def extract(
     heed = Heed(strict)
     loaded = None if scene is None else heed.scene(scene)
     settings = _settings(radius_px, min_confidence, method=method, polarity=polarity)
-    observer = ImageObserver(gamma=1.0 if gamma is None else gamma, settings=settings)
+    observer = ImageObserver(gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera)
     if output is not None:
         refuse_special(output)
+        if output.suffix.lower() in (".xlsx", ".xls", ".ods"):
+            raise InputError("no workbook is written; name the file .csv, which spreadsheets read", source=str(output))
     if is_video(images[0]):
         if len(images) > 1:
             raise InputError("give one video at a time", source=str(images[1]))

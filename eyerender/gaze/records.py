@@ -96,8 +96,9 @@ def _placed(observations: Observations, scene: Scene | None) -> Observations:
     if scene is None or not (lost := np.isnan(index.eye_position_mm).any(axis=1) & (index.eye >= 0)).any():
         return observations
     eyes = np.array([scene.eye_position_mm(name) for name in EYES]) + scene.spec.subject.head_positions_mm[0]
-    place = np.where(lost[:, None], eyes[index.eye] - np.nan_to_num(index.head_mm), index.eye_position_mm)
-    return replace(observations, index=replace(index, eye_position_mm=frozen(place)))
+    head = np.where(lost[:, None], np.nan_to_num(index.head_mm), index.head_mm)
+    place = np.where(lost[:, None], eyes[index.eye] - head, index.eye_position_mm)
+    return replace(observations, index=replace(index, eye_position_mm=frozen(place), head_mm=frozen(head)))
 
 
 class RigFile(FileSpec, Rig):

@@ -57,6 +57,7 @@ class ImageObserver:
     Args:
         settings: settings of the extractor; if the rig is known, the range of pupil sizes is narrowed.
         gamma: encoding gamma of the images; 1 is linear.
+        camera: number of the scene's camera that took single images and videos; None: the first one.
         backend: backend that renders the frames.
         threads: number of processor threads for rendering; None: all.
         progress: called with (images done, images in all, "images") after each image.
@@ -64,6 +65,7 @@ class ImageObserver:
 
     settings: ExtractionSettings = field(default_factory=ExtractionSettings)
     gamma: float = 1.0
+    camera: int | None = None
     backend: BackendChoice = "auto"
     threads: int | None = None
     progress: Progress | None = None
@@ -177,10 +179,35 @@ class ImageObserver:
                         InputWarning(code="skipped", reason=f"is skipped: {error.reason}", source=str(paths[k]))
                     )
         if warn is not None:
-            warn([*skipped, *([colour_warning(coloured, "images" if coloured > 1 else "image")] if coloured else [])])
+            warn(
+                [
+                    *self.camera_warnings(scene),
+                    *skipped,
+                    *([colour_warning(coloured, "images" if coloured > 1 else "image")] if coloured else []),
+                ]
+            )
         if len(skipped) == len(paths):
             raise InputError(f"holds no image that can be used ({skipped[0].reason})", source=skipped[0].source)
         return gathered.all()
+
+    def camera_of(self, scene: Scene) -> PinholeCamera:
+        """Return the scene's camera that took single images.
+
+        Raises:
+            InputError: the scene has no camera of this number.
+        """
+        cameras = scene.rig.cameras
+        if not 0 <= (self.camera or 0) < len(cameras):
+            raise InputError(f"must be 0 to {len(cameras) - 1}, the cameras of the scene", source="--camera")
+        return cameras[self.camera or 0]
+
+    def camera_warnings(self, scene: Scene | None) -> list[InputWarning]:
+        """Warn if a scene has several cameras, and none was named."""
+        if scene is None or self.camera is not None or len(scene.rig.cameras) == 1:
+            return []
+        names = ", ".join(f"{k} {camera.name}" for k, camera in enumerate(scene.rig.cameras))
+        reason = f"the scene has several cameras ({names}); --camera says which one took the images; default: 0"
+        return [InputWarning(code="camera", reason=reason)]
 
     def observe_found(
         self,
@@ -204,13 +231,14 @@ class ImageObserver:
             if scene is not None:
                 # The part of the sensor that a single image shows is unknown, so only a whole sensor image can be
                 # placed.
-                camera = scene.rig.cameras[0]
+                camera = self.camera_of(scene)
                 if shape != (camera.resolution_px[1], camera.resolution_px[0]):
                     raise InputError(f"is {shape[1]} x {shape[0]} px, but the scene's sensor is not", source=source)
                 sides = [EYES.index(name) for name in scene.spec.subject.eyes if camera.sees(name)]
                 eye = sides[0] if len(found) == len(sides) == 1 else eye
                 lights, reasons = _lights(one, np.zeros(2), scene.rig, camera, np.full(3, np.nan), eye)
-            index = Index(frame=np.array([frame]), eye=np.array([eye]), time_s=np.array([time_s]))
+            number = np.array([-1 if scene is None or not self.camera else self.camera])
+            index = Index(frame=np.array([frame]), eye=np.array([eye]), camera=number, time_s=np.array([time_s]))
             parts.append(_observation(one, lights, reasons, np.zeros(2), index))
         return concatenate(parts)
 

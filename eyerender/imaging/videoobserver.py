@@ -104,7 +104,13 @@ def observe_video(
         if file is not None and table:
             file.write(features_csv(gathered.all(), lights_of(scene)).encode())
         if warn is not None:  # before the files are published
-            warn([*video.warnings(), *([colour_warning(coloured, "frames")] if coloured else [])])
+            warn(
+                [
+                    *observer.camera_warnings(scene),
+                    *video.warnings(),
+                    *([colour_warning(coloured, "frames")] if coloured else []),
+                ]
+            )
     return VideoSummary(
         source=video.source,
         frames=count,
