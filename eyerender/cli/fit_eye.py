@@ -35,7 +35,8 @@ def fit_eye(
 
     Args:
         recording: Records as `features` or `extract` write them (JSON, JSONL), or a table (CSV).
-        rig: A rig file or a scene for its rig (default: the rig in the recording).
+        rig: A rig file, or a scene for its rig and for places of eyes that the recording lacks (default: the rig in the
+            recording).
         unknowns: A YAML file with the keys of `er.Unknowns` (default: the priors of a population, 3 mm of slippage).
         eye: Start of the fit and mean of its priors: a catalogue name or an eye file.
         columns: A YAML file with the meaning of a table's columns.
@@ -49,9 +50,11 @@ def fit_eye(
     from ..design.noise import FeatureNoise
     from ..design.unknowns import Unknowns
     from ..eye.catalogue import load_eye
-    from ..gaze.records import load_observations
+    from ..gaze.records import is_rig_file, load_observations
 
-    observations, built = load_observations(recording, rig=rig, columns=columns)
+    # A scene also places eyes whose place is not recorded.
+    whose = {"rig": rig} if rig is None or is_rig_file(rig) else {"scene": rig}
+    observations, built = load_observations(recording, **whose, columns=columns)
     given = None if unknowns is None else Unknowns.load(unknowns)
     noise = FeatureNoise.of(outline_px, glint_px, rig=built)
     fits = fit(observations, built, given, prior=load_eye(eye), noise=noise, targets=targets, robust=robust)

@@ -53,7 +53,7 @@ def load_observations(
         path: JSON as `features` writes it, which includes the rig; JSONL with one record a line; or a table (.csv or
             .tsv, see `observations_from_csv`).
         scene: scene whose rig is used if the file has none. Its subject also places eyes whose place is not recorded.
-        rig: the rig to use instead, or a file that `load_rig` reads; a scene's file places eyes, too.
+        rig: the rig to use instead, or a file that `load_rig` reads.
         columns: meaning of a table's columns.
 
     Raises:
@@ -67,8 +67,6 @@ def load_observations(
     if scene is not None and rig is not None:
         raise InputError("give either a scene or a rig", source="--rig")
     given: RigGeometry | None = None
-    if isinstance(rig, str | Path) and not _is_rig_file(rig):
-        scene, rig = str(rig), None
     whole = load_scene(scene) if isinstance(scene, str) else scene
     if whole is not None:
         given = whole.rig
@@ -113,10 +111,11 @@ def load_rig(path: str | Path) -> RigGeometry:
     Raises:
         InputError: naming the file and the key.
     """
-    return RigFile.load(path).resolved(Path(path).parent).build() if _is_rig_file(path) else load_scene(path).rig
+    return RigFile.load(path).resolved(Path(path).parent).build() if is_rig_file(path) else load_scene(path).rig
 
 
-def _is_rig_file(path: str | Path) -> bool:
+def is_rig_file(path: str | Path) -> bool:
+    """Return whether a file is that of a rig, not of a scene."""
     return Path(path).suffix.lower() in (".yaml", ".yml") and "cameras" in read_yaml(path)
 
 
