@@ -60,6 +60,12 @@ class TrueGlint:
     visible: float = 1.0
     look: GlintLook = GlintLook()
 
+    def __post_init__(self) -> None:
+        """Refuse positions that no image has, with `ValueError`."""
+        x, y = self.xy_px
+        if not max(abs(x), abs(y)) < 1e5:
+            raise ValueError("a glint's position must be finite, in px of the image")
+
     @property
     def match_px(self) -> float:
         """Largest distance of a matching report: two pixels for a point, plus the radius of a large spot."""

@@ -232,13 +232,7 @@ def _ideal(path: Path, name: str, record: Mapping[str, Any], said: Mapping[str, 
         pupil,
         visible=visible,
         bit_depth=depth,
-        glints=tuple(_glint(g["light"], *g["xy_px"]) for g in record["glints"] if g["status"] == "ok"),
+        glints=tuple(TrueGlint(int(g["light"]), tuple(g["xy_px"])) for g in record["glints"] if g["status"] == "ok"),
         hints=NO_HINTS | {"polarity": said["polarity"]},
         known={key: float(said[key]) for key in ("noise_dn", "blur_px", "step_dn")},
     )
-
-
-def _glint(light: Any, x: Any, y: Any) -> TrueGlint:
-    if not max(abs(x), abs(y)) < 1e5:
-        raise ValueError("xy_px")
-    return TrueGlint(int(light), (float(x), float(y)))
