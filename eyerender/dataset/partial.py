@@ -289,11 +289,18 @@ def places(folder: Path, stage: Path, shard: int) -> list[tuple[Path, Path]]:
 
 
 def samples_in(done: Mapping[str, Any]) -> set[int]:
-    """Return the numbers of the samples that a done.json or a checkpoint holds, with those that were given up."""
-    packed = done.get("columns")
-    names = (name.rpartition("/")[2] for name in done["files"] if name.startswith("images/"))
-    own = packed["sample"] if packed else (int(name.partition("-")[0]) for name in names)
-    return {*own, *done["given_up"]}
+    """Return the numbers of the samples that a done.json or a checkpoint holds, with those that were given up.
+
+    Raises:
+        InputError: its files have other names than those that this package gives.
+    """
+    try:
+        packed = done.get("columns")
+        names = (name.rpartition("/")[2] for name in done["files"] if name.startswith("images/"))
+        own = packed["sample"] if packed else (int(name.partition("-")[0]) for name in names)
+        return {*own, *done["given_up"]}
+    except WRONG as error:
+        raise InputError(f"does not name its samples ({type(error).__name__}: {error})", source=DONE) from None
 
 
 def set_aside(folder: Path, shard: int) -> None:
@@ -345,7 +352,7 @@ def _is_needed(stage: Path, folder: Path, shard: int | None) -> bool:
     try:
         own = samples_in(read_done_file(stage / DONE))
         return shard is None or not own <= samples_in(read_done(folder, shard))
-    except (InputError, KeyError, TypeError, ValueError):
+    except InputError:
         return shard is None and (stage / DONE).is_file()
 
 
@@ -357,23 +364,21 @@ def _claimed(folder: Path, shard: int, stage: Path, wanted: set[int]) -> dict[st
     found = []
     finished = folder / SHARDS / shard_name(shard)
     for file in (*(place / DONE for number, place in stages(folder) if number == shard), finished / DONE):
-        with suppress(InputError, KeyError, TypeError, ValueError):
+        with suppress(InputError):
             done = read_done_file(file)
             found.append((len(samples_in(done) & wanted), done, file.parent))
     for _, done, place in sorted(found, key=lambda one: -one[0]):
         with suppress(OSError):
-            if place == finished:
-                folders = [(own, new) for own, new in places(folder, stage, shard) if own.is_dir()]
-            elif samples_in(done) <= wanted:
+            if place != finished and samples_in(done) <= wanted:
                 os.rename(place, stage)
                 return done
-            else:
-                folders = [(own, stage / own.name) for own in place.iterdir() if own.is_dir()]
-            for own, new in folders:
-                make_folder(new)
-                for file in own.iterdir():
-                    if file.name != DONE:
-                        link_or_copy(file, new / file.name)
+            for own, new in places(folder, stage, shard):
+                source = own if place == finished else place / new.name
+                if source.is_dir():
+                    make_folder(new)
+                    for file in source.iterdir():
+                        if file.name != DONE:
+                            link_or_copy(file, new / file.name)
             link_or_copy(place / DONE, stage / DONE)
             return done
     return None

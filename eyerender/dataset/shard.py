@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,9 +110,10 @@ def commit(folder: Path, staged: Staged) -> None:
     """
     stage = Path(staged.stage)
     if is_finished(folder, staged.shard):
-        if samples_in(read_done(folder, staged.shard)) <= samples_in(read_done_file(stage / DONE)):
-            _replace(folder, stage, staged.shard)
-            return
+        with suppress(InputError):  # a done.json that another program wrote names no samples
+            if samples_in(read_done(folder, staged.shard)) <= samples_in(read_done_file(stage / DONE)):
+                _replace(folder, stage, staged.shard)
+                return
         set_aside(folder, staged.shard)
     moves = [(place, own) for place, own in places(folder, stage, staged.shard) if own.is_dir()]
     for place, own in moves:

@@ -126,6 +126,16 @@ def test_a_checkpoint_with_links_is_left_alone(fresh, whole, tmp_path, name):
     assert [place.name for place in victim.iterdir()] == ["thesis.doc"]
 
 
+def test_a_finished_shard_with_strange_names_is_set_aside(fresh, whole, tmp_path):
+    lines = tmp_path / "shards" / "00000"
+    lines.mkdir(parents=True)
+    done = json.loads((whole / "shards" / "00000" / "done.json").read_text())
+    sums = {"bytes": 1, "sha256": "x"}
+    (lines / "done.json").write_text(json.dumps({**done, "files": {"images/00000/abc.png": sums}}))
+    commit(tmp_path, write_shard(fresh, tmp_path, 0, lambda *_: None))
+    assert tree(tmp_path / "images") == tree(whole / "images")
+
+
 def test_folders_in_a_checkpoint_do_not_stop_a_run(fresh, whole, tmp_path):
     stage = tmp_path / ".partial-00000-x"
     (stage / "images" / "sub").mkdir(parents=True)
