@@ -19,7 +19,7 @@ from pathlib import Path
 from ...base.errors import InputError
 from ...base.processes import python_command, run
 from ...base.references import is_reference
-from ...base.storage.files import MAX_FILE_BYTES, appended, read_bytes, read_text, write_text
+from ...base.storage.files import MAX_FILE_BYTES, appended, parse_json, read_bytes, read_text, write_text
 from ...folders.imagefolder import versions
 from ...folders.outfolder import mark
 from .labelled import BenchImage
@@ -44,8 +44,8 @@ class Answers:
         with suppress(InputError):
             lines = [] if path is None or fresh else read_text(path, limit=MAX_FILE_BYTES, follow=False).splitlines()
         for line in lines[1:] if lines[:1] == [self._first] else ():
-            with suppress(ValueError, TypeError):  # the last line of a killed run may be truncated
-                extractor, row, text, greeting, trip_s = json.loads(line)
+            with suppress(InputError, ValueError, TypeError):  # the last line of a killed run may be truncated
+                extractor, row, text, greeting, trip_s = parse_json(line)
                 self._known[extractor, row] = text, greeting, trip_s
 
     def get(self, extractor: str, row: int) -> tuple[str, str, float] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bytes, Floats
+from ...base.storage.files import parse_json
 from ...optics.ellipse import Ellipse, signed_distance
 from ...scene.parts import BACKGROUND
 
@@ -71,7 +71,7 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
     distance = float(np.linalg.norm(toward))
     if math.degrees(math.acos(float(np.asarray(world["optic_axis"]) @ toward) / distance)) > 50.0:
         out.add("view > 50 deg")
-    scene = json.loads(parameters.get("scene_json") or "{}")
+    scene = parse_json(parameters.get("scene_json") or "{}", path="scene_json")
     sensor, motion, ambient = (scene.get(key) or {} for key in ("sensor", "motion", "ambient"))
     speed_px_ms = math.radians(math.hypot(*motion.get("eye_deg_s", (0.0, 0.0)))) * 1e-3
     speed_px_ms *= _ROTATION_MM * float(K[0, 0]) / distance

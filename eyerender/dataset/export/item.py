@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from ...base.arrays import Bytes, Floats, Ints
 from ...base.errors import WRONG, InputError
 from ...base.processes import ordered
+from ...base.storage.files import parse_json
 from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, opened_entries
 from ...optics.ellipse import Ellipse, signed_distance
@@ -145,7 +145,7 @@ class Item:
         """Number and name of the camera, by column; the name is that of the scene."""
         parameters = self.line["parameters"]
         number = int(parameters.get("camera", 0))
-        cameras = json.loads(parameters["scene_json"]).get("rig", {}).get("cameras", [])
+        cameras = parse_json(parameters["scene_json"], path="scene_json").get("rig", {}).get("cameras", [])
         name = cameras[number].get("name", "camera") if number < len(cameras) else "camera"
         return {"camera": number, "camera_name": str(name)}
 

@@ -6,7 +6,6 @@ analytic record, and the labels that follow from pose and parameters.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -159,7 +158,7 @@ class DatasetTruth:
         """Return the sample with the exposure in its line, because automatic exposure depends on the pixels."""
         if self.plan.spec.auto_exposure is None or found.sample is None:
             return found
-        return found.exposed(json.loads(line["parameters"]["scene_json"])["sensor"]["exposure_ms"])
+        return found.exposed(parse_json(line["parameters"]["scene_json"], path="scene_json")["sensor"]["exposure_ms"])
 
 
 @dataclass
