@@ -62,12 +62,15 @@ class EstimatorFlags:
         terms_y: regression: your own terms of y.
         monocular: regression: use the vector of one eye in pixels, without dividing it by the distance between the
             pupils.
-        feature: direction-regression: the vector from the mean of all glints to the pupil, or the pupil's centre alone.
+        feature: direction-regression: the vectors from the glints to the pupil, or the pupil's centre alone.
         method: guestrin-eizenman: locate the corneal centre from all glints (A), or on the common line of the planes
             (B).
         free_index: guestrin-eizenman: also calibrate the refractive index.
         index: guestrin-eizenman, hennessey: the assumed refractive index.
         recalibration: hennessey, shih-wu-liu: the quantity that the correction polynomial acts on.
+        lights: Use the glints of these lights only, counted from 0, such as '0,2,4': one for regression, four for
+            homography (top left, top right, bottom right, bottom left), five for cross-ratio (the corners, then the
+            camera's), any number for the others but maximum-likelihood, which uses all.
         fixations: Calibrate on these fixations only, counted from 0, such as '0,4,8'.
     """
 
@@ -80,6 +83,7 @@ class EstimatorFlags:
     free_index: bool = False
     index: float | None = None
     recalibration: Literal["angle", "screen", "none"] = "angle"
+    lights: str | None = None
     fixations: str | None = None
 
     def choose(self, name: str) -> GazeEstimator:
@@ -95,6 +99,9 @@ class EstimatorFlags:
         options = asdict(self)
         terms = options.pop("terms_x"), options.pop("terms_y")
         del options["fixations"]
+        options["lights"] = _numbers(self.lights, "--lights")
+        if options["lights"] is not None and name == "maximum-likelihood":
+            raise InputError("maximum-likelihood uses every glint", source="--lights")
         options["normalised"] = not options.pop("monocular")
         return choose_estimator(name, terms=None if None in terms else terms, **options)
 
@@ -104,9 +111,11 @@ class EstimatorFlags:
         Raises:
             InputError: they are not whole numbers.
         """
-        if self.fixations is None:
-            return None
-        try:
-            return [int(part) for part in self.fixations.split(",") if part.strip()]
-        except ValueError:
-            raise InputError(f"{self.fixations!r} is not a list of whole numbers", source="--fixations") from None
+        return _numbers(self.fixations, "--fixations")
+
+
+def _numbers(text: str | None, option: str) -> list[int] | None:
+    try:
+        return None if text is None else [int(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        raise InputError(f"{text!r} is not a list of whole numbers", source=option) from None

@@ -31,8 +31,20 @@ class EstimatorOptions(Spec):
     free_index: bool = False
     index: Annotated[float, Field(ge=1, le=2)] | None = None
     recalibration: RecalibrationKind = "angle"
+    lights: tuple[Annotated[int, Field(ge=0, le=9999)], ...] | None = None
     eye: str = "E2"
     slippage_mm: Annotated[float, Field(ge=0, le=50)] = 3.0
+
+
+def this_many(lights: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """Return the lights of an option, of which an estimator needs `count`.
+
+    Raises:
+        InputError: there are more or fewer.
+    """
+    if len(lights) != count:
+        raise InputError(f"must be {count} light{'s' if count > 1 else ''} for this estimator", path="lights")
+    return lights
 
 
 class BuiltIn(StoredEstimator):

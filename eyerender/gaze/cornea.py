@@ -11,12 +11,13 @@ axes broadcast, so that many sets of parameters are one batch.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Bools, Floats, frozen
-from .rays import unit
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen
+from .rays import FeatureRays, unit, with_equal_glints
 
 # Starting distances of a cornea from its camera, in corneal radii: 30 mm to 10 m.
 _START = np.geomspace(4.0, 1300.0, 12)
@@ -41,6 +42,31 @@ class CorneaCentres(ArrayValue):
     distance_mm: Floats
     residual_mm: Floats
     ok: Bools
+
+
+def centres_of(
+    rays: FeatureRays, rows: Ints, radius_mm: Floats, find: Callable[..., CorneaCentres] | None = None
+) -> tuple[Floats, Bools]:
+    """Compute centres (..., n, 3) of the rows' corneas, each from the glints that it has, and whether it has one.
+
+    Args:
+        rays: rays of all observations.
+        rows: (n,) observations.
+        radius_mm: (..., n) corneal radius.
+        find: the method, `from_all_glints` (default) or `from_plane`.
+    """
+    centre, ok = np.full((*radius_mm.shape, 3), np.nan), np.zeros(radius_mm.shape, dtype=bool)
+    for part, columns in with_equal_glints(rays.glints[rows]):
+        if len(columns) >= 2:
+            one = np.ix_(rows[part], columns)
+            found = (find or from_all_glints)(
+                rays.origin_mm[rows[part]],
+                glints=rays.glints[one],
+                light_mm=rays.light_mm[one],
+                radius_mm=radius_mm[..., part],
+            )
+            centre[..., part, :], ok[..., part] = found.centre_mm, found.ok
+    return centre, ok
 
 
 def from_all_glints(origin_mm: Floats, *, glints: Floats, light_mm: Floats, radius_mm: Floats) -> CorneaCentres:

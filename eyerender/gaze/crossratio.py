@@ -20,7 +20,7 @@ from ..base.errors import InputError
 from ..base.spec import Spec
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
-from .builtin import BuiltIn
+from .builtin import BuiltIn, EstimatorOptions, this_many
 from .estimate import GazePoints
 from .homography import homography, transformed
 from .rays import calibrated_eyes, chosen_lights, eyes_of, glints_of, is_none, screen_of
@@ -50,6 +50,20 @@ class CrossRatio(BuiltIn):
     alphas: Mapping[int, Floats] = field(default_factory=dict)
 
     BY_EYE, EYE, ARRAY = "alphas", _EyeAlphas, "alpha"
+
+    @classmethod
+    def of(cls, options: EstimatorOptions) -> Self:
+        """Create the estimator, not calibrated.
+
+        Raises:
+            InputError: the lights are not five.
+        """
+        a, b, c, d, camera = this_many((0, 1, 2, 3, 4) if options.lights is None else options.lights, 5)
+        return cls((a, b, c, d), camera)
+
+    def options(self) -> EstimatorOptions:
+        """Return the options for a file."""
+        return EstimatorOptions(lights=(*self.corners, self.at_camera))
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate alpha_i of each eye on fixations of the four corner lights; average repeated fixations.

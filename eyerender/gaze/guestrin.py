@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
@@ -25,7 +25,7 @@ from ..rig.rig import RigGeometry, RigLike
 from ..rig.screen import ScreenPlane
 from ..scene.observation import Observations
 from .builtin import BuiltIn, EstimatorOptions
-from .cornea import CorneaCentres, from_all_glints, from_plane, optic_axis
+from .cornea import centres_of, from_all_glints, from_plane, optic_axis
 from .estimate import GazePoints, GazeRays
 from .parameters import HUMAN_BOUNDS, MEAN_EYE, NAMES, Calibration, EyeParameters, ParameterBounds
 from .rays import (
@@ -60,7 +60,7 @@ class GuestrinEizenman(BuiltIn):
     (90, 3)
 
     Args:
-        lights: lights whose glints are used; None: all of the rig's.
+        lights: lights whose glints are used; None: all of the rig's. An observation needs two of these glints.
         centre: "all_glints" (method A, the source's own) or "plane" (method B, the first light's mirror condition).
         start: parameters at the start of the calibration; its index is kept unless `free_index`.
         bounds: limits of the parameters.
@@ -83,12 +83,14 @@ class GuestrinEizenman(BuiltIn):
     def of(cls, options: EstimatorOptions) -> Self:
         """Create the estimator, not calibrated."""
         centre: Literal["all_glints", "plane"] = "plane" if options.method == "B" else "all_glints"
-        return cls(centre=centre, start=EyeParameters.with_index(options.index), free_index=options.free_index)
+        start = EyeParameters.with_index(options.index)
+        return cls(lights=options.lights, centre=centre, start=start, free_index=options.free_index)
 
     def options(self) -> EstimatorOptions:
         """Return the options for a file."""
         index = None if self.start == MEAN_EYE else self.start.index
-        return EstimatorOptions(method="B" if self.centre == "plane" else "A", free_index=self.free_index, index=index)
+        method: Literal["A", "B"] = "B" if self.centre == "plane" else "A"
+        return EstimatorOptions(method=method, free_index=self.free_index, index=index, lights=self.lights)
 
     def with_parameters(self, parameters: Mapping[int, EyeParameters]) -> Self:
         """Create an estimator with known parameters by eye (0 right, 1 left), without a calibration."""
@@ -154,22 +156,21 @@ class GuestrinEizenman(BuiltIn):
         centre, axis = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         for rows, calibration in calibrated_eyes(observations, self.calibrations, reason):
             R, K, index, _, _ = calibration.parameters.vector()
-            found = self._centres(rays, rows, np.full(len(rows), R))
+            c, found = self._centres(rays, rows, np.full(len(rows), R))
             w, meets, inside = optic_axis(
                 rays.origin_mm[rows],
                 pupil=rays.pupil[rows],
-                centre_mm=found.centre_mm,
+                centre_mm=c,
                 radius_mm=np.full(len(rows), R),
                 distance_mm=np.full(len(rows), K),
                 index=np.full(len(rows), index),
             )
             reason[rows] = _why(found, meets, inside)
-            centre[rows], axis[rows] = found.centre_mm, w
+            centre[rows], axis[rows] = c, w
         return GazeRays.of(centre, axis, reason)
 
-    def _centres(self, rays: FeatureRays, rows: Any, radius: Floats) -> CorneaCentres:
-        find = from_plane if self.centre == "plane" else from_all_glints
-        return find(rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm[rows], radius_mm=radius)
+    def _centres(self, rays: FeatureRays, rows: Ints, radius: Floats) -> tuple[Floats, Bools]:
+        return centres_of(rays, rows, radius, from_plane if self.centre == "plane" else from_all_glints)
 
     def turned(self, w: Floats, alpha: ArrayLike, beta: ArrayLike) -> Floats:
         """Turn optic axes w (..., 3) to visual axes (..., 3): by alpha towards +y and by beta upwards, in radians."""
@@ -277,7 +278,7 @@ class _Model:
         self.middle, self.half = 0.5 * (np.sqrt(low) + np.sqrt(high)), 0.5 * (np.sqrt(high) - np.sqrt(low))
         nodes = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
         radius = np.broadcast_to(((self.middle + self.half * nodes) ** 2)[:, None], (_DEGREE + 1, len(rows)))
-        centres = estimator._centres(rays, rows, radius).centre_mm.reshape(_DEGREE + 1, -1)
+        centres = estimator._centres(rays, rows, radius)[0].reshape(_DEGREE + 1, -1)
         self._series = np.linalg.solve(chebvander(nodes, _DEGREE), centres)
 
     def misses(self, parameters: Floats) -> Floats:
@@ -305,10 +306,10 @@ class _Model:
         return self.estimator.search(self.misses, start)
 
 
-def _why(found: CorneaCentres, meets: Bools, inside: Bools) -> Objects:
+def _why(found: Bools, meets: Bools, inside: Bools) -> Objects:
     """Return why an observation has no optic axis; None if it has one."""
     out = np.full(len(meets), None, dtype=object)
     out[~inside] = "the refracted pupil ray misses the sphere that holds the pupil"
     out[~meets] = "the pupil ray misses the cornea"
-    out[~found.ok] = "the glints determine no centre of corneal curvature (camera, lights and eye are coplanar)"
+    out[~found] = "the glints determine no centre of corneal curvature (camera, lights and eye are coplanar)"
     return out

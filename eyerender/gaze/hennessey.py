@@ -35,7 +35,7 @@ class Hennessey(Recalibrated):
     Args:
         parameters: the assumed eye; its alpha and beta are not used.
         recalibration: "angle", "screen" or "none".
-        lights: lights whose glints are used; None: all of the rig's.
+        lights: lights whose glints are used; None: all of the rig's. An observation needs two of these glints.
         correction: the calibrated correction, set by `fit`.
     """
 
@@ -47,12 +47,12 @@ class Hennessey(Recalibrated):
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
         """Create the estimator, not calibrated."""
-        return cls(EyeParameters.with_index(options.index), options.recalibration)
+        return cls(EyeParameters.with_index(options.index), options.recalibration, options.lights)
 
     def options(self) -> EstimatorOptions:
         """Return the options for a file."""
         index = None if self.parameters == MEAN_EYE else self.parameters.index
-        return EstimatorOptions(index=index, recalibration=self.recalibration)
+        return EstimatorOptions(index=index, recalibration=self.recalibration, lights=self.lights)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate the correction of each eye.

@@ -22,7 +22,7 @@ from ..base.errors import InputError
 from ..base.spec import Spec
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
-from .builtin import BuiltIn
+from .builtin import BuiltIn, EstimatorOptions, this_many
 from .estimate import GazePoints
 from .rays import calibrated_eyes, chosen_lights, eyes_of, glints_of, is_none, screen_of, targets_on_screen
 
@@ -54,6 +54,20 @@ class Homography(BuiltIn):
     homographies: Mapping[int, Floats] = field(default_factory=dict)
 
     BY_EYE, EYE, ARRAY = "homographies", _EyeHomography, "homography"
+
+    @classmethod
+    def of(cls, options: EstimatorOptions) -> Self:
+        """Create the estimator, not calibrated.
+
+        Raises:
+            InputError: the lights are not four.
+        """
+        a, b, c, d = this_many(cls().lights if options.lights is None else options.lights, 4)
+        return cls((a, b, c, d))
+
+    def options(self) -> EstimatorOptions:
+        """Return the options for a file."""
+        return EstimatorOptions(lights=self.lights)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate H_c of each eye.

@@ -22,7 +22,7 @@ from ..base.storage.files import csv_text
 from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
 from ..scene.observation import EYES, Observations
-from .cornea import from_all_glints
+from .cornea import centres_of
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .parameters import MEAN_EYE
 from .rays import NOT_CALIBRATED, feature_rays, is_none, targets_on_screen
@@ -234,11 +234,7 @@ def _corneal_centres(observations: Observations, rig: RigGeometry) -> Floats:
         return centre
     rays = feature_rays(observations, rig, None, least=2)
     rows = np.flatnonzero(is_none(rays.reason))
-    if len(rows):
-        radius = np.full(len(rows), MEAN_EYE.cornea_radius_mm)
-        centre[rows] = from_all_glints(
-            rays.origin_mm[rows], glints=rays.glints[rows], light_mm=rays.light_mm[rows], radius_mm=radius
-        ).centre_mm
+    centre[rows], _ = centres_of(rays, rows, np.full(len(rows), MEAN_EYE.cornea_radius_mm))
     return centre
 
 

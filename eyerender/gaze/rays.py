@@ -29,7 +29,7 @@ class FeatureRays(ArrayValue):
     Attributes:
         origin_mm: (n, 3) nodal points.
         pupil: (n, 3) unit rays to the pupil centre.
-        glints: (n, m, 3) unit rays to the glints.
+        glints: (n, m, 3) unit rays to the glints; NaN where a frame lacks one.
         light_mm: (n, m, 3) lights of the glints.
         reason: (n,) why an observation has no rays, None where it has.
     """
@@ -50,7 +50,7 @@ def feature_rays(
         observations: n observations.
         rig: the rig that observed them.
         lights: lights of the glints, as for `chosen_lights`.
-        least: smallest number of lights that is accepted.
+        least: how many glints an observation must have, and lights the rig.
 
     Raises:
         InputError: the rig has fewer than `least` lights, or not those that are named.
@@ -58,7 +58,7 @@ def feature_rays(
     wanted = chosen_lights(observations, rig, lights, least)
     camera, reason = camera_of(observations, rig)
     n, m = wanted.shape
-    places, missing = glints_of(observations, wanted)
+    places, missing = glints_of(observations, wanted, least)
     reason = np.where(camera < 0, reason, missing)
     origin, pupil, glints = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, m, 3), np.nan)
     for k in np.unique(camera[camera >= 0]):
@@ -76,16 +76,30 @@ def feature_rays(
     )
 
 
-def glints_of(observations: Observations, lights: Ints) -> tuple[Floats, Objects]:
-    """Return glints (n, m, 2) px of the lights (n, m), and why an observation lacks pupil or glint (n,)."""
+def glints_of(observations: Observations, lights: Ints, least: int | None = None) -> tuple[Floats, Objects]:
+    """Return glints (n, m, 2) px of the lights (n, m), and why an observation lacks pupil or glints (n,).
+
+    An observation needs `least` of the glints (None: all). Those that it lacks are NaN.
+    """
     reason = np.full(len(observations), None, dtype=object)
     reason[~observations.pupil.ok] = "no pupil"
-    places = np.full((*lights.shape, 2), np.nan)
+    places, found = np.full((*lights.shape, 2), np.nan), np.zeros(lights.shape, dtype=bool)
     for j, light in enumerate(lights.T):
-        places[:, j], found = observations.glints.of_light(light)
-        for row in np.flatnonzero(is_none(reason) & ~found):
-            reason[row] = f"no glint of light {light[row]}"
+        places[:, j], found[:, j] = observations.glints.of_light(light)
+    places[~found] = np.nan
+    need = lights.shape[1] if least is None else least
+    for row in np.flatnonzero(is_none(reason) & (found.sum(axis=1) < need)):
+        lost = lights[row][~found[row]]
+        one = f"no glint of light {lost[0]}"
+        reason[row] = one if need == lights.shape[1] else f"{found[row].sum()} glints, but {need} are needed"
     return places, reason
+
+
+def with_equal_glints(glints: Floats) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the rows of rays (n, m, 3) that have the same glints, not NaN, and the columns of these glints."""
+    present = np.isfinite(glints).all(axis=-1)
+    for pattern in np.unique(present, axis=0):
+        yield np.flatnonzero((present == pattern).all(axis=1)), np.flatnonzero(pattern)
 
 
 def chosen_lights(observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, least: int) -> Ints:

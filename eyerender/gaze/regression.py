@@ -9,9 +9,10 @@ vector is that of one eye alone (Morimoto & Mimica, CVIU 98, 2005).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Generic, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -22,7 +23,7 @@ from ..base.spec import Spec
 from ..base.storage.files import shown
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import Observations
-from .builtin import BuiltIn, EstimatorOptions
+from .builtin import BuiltIn, EstimatorOptions, this_many
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
 from .rays import (
@@ -89,13 +90,16 @@ class PolynomialFit(Spec):
     b: tuple[float, ...]
 
 
-class PolynomialEstimator(BuiltIn):
-    """An estimator with two polynomials of a vector for each eye."""
+Fit = TypeVar("Fit", bound=Spec)
+
+
+class PolynomialEstimator(BuiltIn, Generic[Fit]):
+    """An estimator with pairs of polynomials of a vector for each eye, stored as a `Fit`."""
 
     __slots__ = ()
-    BY_EYE, EYE = "fits", PolynomialFit
+    BY_EYE = "fits"
     function: str | tuple[str, str]
-    fits: Mapping[int, PolynomialFit]
+    fits: Mapping[int, Fit]
 
     def __post_init__(self) -> None:
         """Check the function where it is written.
@@ -126,7 +130,11 @@ class PolynomialEstimator(BuiltIn):
         """The option that states the function, or its terms."""
         return {("function" if isinstance(self.function, str) else "terms"): self.function}
 
-    def with_eyes(self, eyes: Mapping[int, PolynomialFit]) -> Self:
+    @abstractmethod
+    def polynomials_of(self, fit: Fit) -> Iterable[PolynomialFit]:
+        """Return the pairs of polynomials of an eye."""
+
+    def with_eyes(self, eyes: Mapping[int, Fit]) -> Self:
         """Return a copy with these coefficients.
 
         Raises:
@@ -134,23 +142,20 @@ class PolynomialEstimator(BuiltIn):
         """
         for key, terms in zip("ab", self.terms, strict=True):
             for eye, fit in eyes.items():
-                if len(getattr(fit, key)) != len(terms):
+                if any(len(getattr(one, key)) != len(terms) for one in self.polynomials_of(fit)):
                     path = f"eyes.{eye_name(eye)}.{key}"
                     raise InputError(f"must be {len(terms)} numbers, one for each term", path=path)
         return replace(self, fits=eyes)
 
-    def mapped(self, vectors: Floats, observations: Observations, reason: Objects) -> Floats:
-        """Evaluate the polynomials at vectors (n, 2), (n, 2); eyes without a fit get NaN and a reason."""
-        out = np.full(vectors.shape, np.nan)
+    def evaluated(self, fit: PolynomialFit, vectors: Floats) -> Floats:
+        """Evaluate a pair of polynomials at vectors (n, 2), (n, 2)."""
         x_terms, y_terms = self.terms
-        for rows, fit in calibrated_eyes(observations, self.fits, reason):
-            u = (vectors[rows] - fit.origin) / fit.scale
-            out[rows] = np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
-        return out
+        u = (vectors - fit.origin) / fit.scale
+        return np.stack([monomials(u, x_terms) @ fit.a, monomials(u, y_terms) @ fit.b], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
-class Regression(PolynomialEstimator):
+class Regression(PolynomialEstimator[PolynomialFit]):
     """Polynomial regression on the vector from one light's glint to the pupil.
 
     >>> scene = er.load_scene("blignaut2014")
@@ -174,6 +179,8 @@ class Regression(PolynomialEstimator):
     centred: bool = False
     fits: Mapping[int, PolynomialFit] = field(default_factory=dict, repr=False)
 
+    EYE = PolynomialFit
+
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
         """Create the estimator, not calibrated.
@@ -181,11 +188,12 @@ class Regression(PolynomialEstimator):
         Raises:
             InputError: there is no such function.
         """
-        return cls(options.terms or options.function, normalised=options.normalised).with_eyes({})
+        (light,) = this_many((0,) if options.lights is None else options.lights, 1)
+        return cls(options.terms or options.function, light, normalised=options.normalised).with_eyes({})
 
     def options(self) -> EstimatorOptions:
         """Return the options for a file."""
-        return EstimatorOptions(**self.function_option, normalised=self.normalised)
+        return EstimatorOptions(**self.function_option, normalised=self.normalised, lights=(self.light,))
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate each eye.
@@ -232,7 +240,14 @@ class Regression(PolynomialEstimator):
         """Estimate gaze points on the screen's plane."""
         screen = screen_of(rig.build())
         v, reason = pupil_glint_vectors(observations, self.light, self.normalised, rig.build())
-        return GazePoints.of(screen.world(self.mapped(v, observations, reason)), reason)
+        out = np.full(v.shape, np.nan)
+        for rows, fit in calibrated_eyes(observations, self.fits, reason):
+            out[rows] = self.evaluated(fit, v[rows])
+        return GazePoints.of(screen.world(out), reason)
+
+    def polynomials_of(self, fit: PolynomialFit) -> Iterable[PolynomialFit]:
+        """Return the polynomials of an eye."""
+        return (fit,)
 
     def _solve(self, design: Floats, wanted: Floats, eye: str) -> Floats:
         solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=None)

@@ -20,7 +20,7 @@ from ..scene.observation import Observations
 from .builtin import RecalibrationKind
 from .cornea import line_to_centre
 from .estimate import GazeRays
-from .rays import FeatureRays, feature_rays, is_none, unit
+from .rays import FeatureRays, feature_rays, is_none, unit, with_equal_glints
 from .recalibration import Recalibrated, Recalibration
 
 # Below this sine two lines or planes count as parallel, because rounding would determine where they meet.
@@ -40,7 +40,7 @@ class ShihWuLiu(Recalibrated):
     Args:
         recalibration: "angle", "screen" or "none".
         cameras: the two cameras.
-        lights: lights whose glints are used; None: all of the rig's.
+        lights: lights whose glints are used; None: all of the rig's. An observation needs two of these glints.
         correction: the calibrated correction, set by `fit`.
     """
 
@@ -49,7 +49,7 @@ class ShihWuLiu(Recalibrated):
     lights: tuple[int, ...] | None = None
     correction: Recalibration | None = field(default=None, repr=False)
 
-    OPTIONS = ("recalibration",)
+    OPTIONS = ("recalibration", "lights")
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Calibrate the correction of each eye.
@@ -71,7 +71,11 @@ class ShihWuLiu(Recalibrated):
         if len(set(self.cameras)) != 2 or not all(0 <= k < len(rig.cameras) for k in self.cameras):
             raise InputError(f"this estimator needs two cameras, but the rig has {len(rig.cameras)}")
         rays = feature_rays(observations, rig, self.lights, least=2)
-        lines, good = line_to_centre(rays.origin_mm, rays.glints, rays.light_mm)
+        lines, good = np.full((len(observations), 3), np.nan), np.zeros(len(observations), dtype=bool)
+        for rows, columns in with_equal_glints(rays.glints):
+            if len(columns) >= 2:
+                one = np.ix_(rows, columns)
+                lines[rows], good[rows] = line_to_centre(rays.origin_mm[rows], rays.glints[one], rays.light_mm[one])
         own: Objects = rays.reason.copy()
         own[is_none(own) & ~good] = "the glints determine no line to the centre of corneal curvature"
         first, second = self._pairs(observations)

@@ -114,7 +114,7 @@ def test_a_calibration_with_options_survives_its_file(scene, tmp_path, estimator
 
 @pytest.mark.parametrize(
     "estimator",
-    [er.gaze.Regression("R2", light=1), er.gaze.Hennessey(lights=(0, 1)), er.gaze.Homography(lights=(3, 2, 1, 0))],
+    [er.gaze.Regression("R2", centred=True), er.gaze.Homography(conditioned=False)],
     ids=lambda e: type(e).__name__,
 )
 def test_options_that_a_file_does_not_hold_are_refused(tmp_path, estimator):
