@@ -3,5 +3,6 @@ from .benchmark.protocol import Extractor as Extractor
 from .benchmark.run import bench_extractors as bench_extractors
 from .quickstart import compare_folder as compare_folder
 from .quickstart import run_quickstart as run_quickstart
+from .rigs.compare import compare_rigs as compare_rigs
 
 __all__: list[str]

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from ..apps.rigs.options import RigSize
+from ..base.errors import InputError
 from .app import app
 from .options import Backend, OutputFolder, Overwrite, Result
 from .output import emit, progress
@@ -16,10 +17,8 @@ from .population import read_population
 
 @app.command(name="rig")
 def rig(
-    scene: str,
-    /,
-    *,
-    output: OutputFolder,
+    *scenes: str,
+    output: OutputFolder | None = None,
     population: str = "adults",
     size: Annotated[RigSize, Parameter(name="*")] = RigSize(),
     unknowns: Path | None = None,
@@ -32,21 +31,36 @@ def rig(
     The folder receives report.html, summary.json, people.csv (one row per person) and gaze.csv (one row per direction):
     the bound by noise alone, visible outline and glints, errors of estimators on exact features, and eye safety.
 
+    Two or more scenes are compared over the same people: differences with 95 % intervals, which is better, for whom.
+
     Args:
-        scene: A scene file or the name of a shipped one: its rig, sensor, first eye and first head position.
+        scenes: Scene files or names of shipped ones: their rigs, sensors, first eyes and first head positions.
         population: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of
             `population`.
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
     """
+    from ..apps.rigs.compare import compare_rigs, text_of
     from ..apps.rigs.report import REPORT, run_rig
     from ..design.unknowns import Unknowns
     from ..scene import load_scene
 
     given = None if unknowns is None else Unknowns.load(unknowns)
     everyone = read_population(population, "--population")
+    if not scenes:
+        raise InputError("needs a scene, or several to compare", source="SCENES")
+    loaded = [load_scene(scene) for scene in scenes]
+    if len(loaded) > 1:
+        if size.images or given is not None:
+            raise InputError("is for one rig", source="--images" if size.images else "--unknowns")
+        with progress("rig") as steps:
+            compared = compare_rigs(loaded, everyone, size, output=output, overwrite=overwrite, progress=steps)
+        emit(compared, text_of(compared) + (f"\n\nreport: {output / REPORT}" if output is not None else ""), json)
+        return 0
+    if output is None:
+        raise InputError("is needed for one rig", source="--output")
     with progress("rig") as steps:
         found = run_rig(
-            load_scene(scene), everyone, output, size, unknowns=given, backend=backend, overwrite=overwrite,
+            loaded[0], everyone, output, size, unknowns=given, backend=backend, overwrite=overwrite,
             progress=steps,
         )  # fmt: skip
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
@@ -59,10 +73,13 @@ def _text(found: dict[str, Any]) -> str:
 
     covered = found["coverage"]["outline_and_2_glints"]
     bound, noise, safety = found["bound_deg"], found["frame_to_frame_deg"], found["safety"]
+    fixating = found["bound_with_fixation_deg"]
     lines = [
         f"{found['people']} people in {found['directions']} directions",
         f"frame to frame, noise only:      U50E95 {degrees(noise['U50E95'])}, U95E95 {degrees(noise['U95E95'])}",
         f"after a calibration, noise only: U50E95 {degrees(bound['U50E95'])}, U95E95 {degrees(bound['U95E95'])}",
+        f"  with {fixating['fixation_deg']:g} deg of fixation noise:   "
+        f"U50E95 {degrees(fixating['U50E95'])}, U95E95 {degrees(fixating['U95E95'])}",
         f"2 glints and 60 % of the outline: {100 * covered:.1f} % of people x directions",
     ]
     for name, one in found["estimators"].items():
@@ -72,5 +89,8 @@ def _text(found: dict[str, Any]) -> str:
         if one["U50E95"] is not None:
             lines.append(f"{name} on rendered images: U50E95 {degrees(one['U50E95'])}")
     if "cornea_share" in safety:
-        lines.append(f"cornea: {100 * safety['cornea_share']:.2f} % of the limit ({safety['note']})")
+        lines.append(
+            f"cornea: {100 * safety['cornea_share']:.2f} % of the limit, "
+            f"{100 * safety['stuck_on']['cornea_share']:.2f} % with the LEDs stuck on ({safety['note']})"
+        )
     return "\n".join(lines)

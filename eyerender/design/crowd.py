@@ -9,7 +9,7 @@ from itertools import repeat
 
 import numpy as np
 
-from ..base.arrays import Floats, finite_or_none
+from ..base.arrays import Bools, Floats, finite_or_none
 from ..base.processes import mapper
 from ..base.progress import Progress, notify
 from .noise import FeatureNoise
@@ -73,17 +73,33 @@ def _reported(results: Iterator[Figures], counts: Sequence[int], progress: Progr
 
 
 def users_of(values: Floats) -> dict[str, float | None]:
-    """Compute the median (U50E95) and 95th-percentile (U95E95) user's 95th-percentile error; values (people, 81)."""
-    if not values.size or np.isnan(values).all():
-        return {"U50E95": None, "U95E95": None}
-    each = np.quantile(np.where(np.isnan(values), np.inf, values), 0.95, axis=1, method="higher")
-    return {f"U{u}E95": finite_or_none(np.quantile(each, u / 100, method="higher")) for u in (50, 95)}
+    """Compute the median (U50E95) and 95th-percentile (U95E95) user's 95th-percentile error.
+
+    Values (people, directions) that are NaN, where there is none, are not counted; their share is the dropout.
+    """
+    there = [row[~np.isnan(row)] for row in values]
+    each = [float(np.quantile(row, 0.95, method="higher")) for row in there if len(row)]
+    dropout = finite_or_none(np.isnan(values).mean()) if values.size else None
+    if not each:
+        return {"U50E95": None, "U95E95": None, "dropout": dropout}
+    users = {f"U{u}E95": finite_or_none(np.quantile(each, u / 100, method="higher")) for u in (50, 95)}
+    return {**users, "dropout": dropout}
+
+
+def covered(found: Figures, glints: int = 2) -> Bools:
+    """Return which people and directions (p, 81) have so many glints and at least `OUTLINE` of the outline."""
+    return np.asarray((found.outline >= OUTLINE) & (found.glints >= glints))
+
+
+def gaze_of(values: Floats, seen: Bools) -> dict[str, float | None]:
+    """Summarise errors (p, 81) deg where they are `seen`: median over all, and `users_of`."""
+    there = np.where(seen, values, np.nan)
+    return {"median": finite_or_none(np.nanmedian(there)) if seen.any() else None, **users_of(there)}
 
 
 def coverage_of(found: Figures) -> dict[str, float]:
     """Compute the share of people times directions with each number of glints and at least `OUTLINE` of the outline."""
-    outline = found.outline >= OUTLINE
     return {
-        "outline": float(outline.mean()),
-        **{f"outline_and_{k}_glints": float((outline & (found.glints >= k)).mean()) for k in (1, 2, 3)},
+        "outline": float(covered(found, 0).mean()),
+        **{f"outline_and_{k}_glints": float(covered(found, k).mean()) for k in (1, 2, 3)},
     }

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.errors import InputError
 from ..rig.camera import PinholeCamera
+from ..rig.defocus import confusion_px
 from ..rig.exposure import electrons, iris_radiance, radiance_to_irradiance
 from ..rig.light import Lamp
 from ..rig.rig import RigGeometry
@@ -36,6 +37,8 @@ FIXATION_DEG = 0.3
 PUPIL_SHARE = 0.1
 """Light of the dark pupil, as a share of the iris' (chosen)."""
 CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
+PUPIL_DEPTH_MM, ROTATION_MM = 3.5, 10.0
+"""Depth of the pupil behind the corneal apex, and its distance from the centre of rotation (both rounded)."""
 _SAMPLES, _REACH = 400, 6.0
 
 
@@ -80,6 +83,8 @@ def sensor_noise(
     """Compute the feature noise of a scene from its lamps, sensor and iris albedo, without rendering.
 
     The levels of a camera are those of the first eye that it sees, at its reference position, looking straight ahead.
+    Its blur is the sensor's, a pixel's area, the circle of confusion at the pupil and half of the path of the pupil
+    during the exposure (across and along it), each by its variance.
 
     >>> (er.sensor_noise(er.load_scene("headset")).outline_px < 1).tolist()
     [True]
@@ -91,7 +96,6 @@ def sensor_noise(
     """
     rig, sensor = scene.rig, scene.spec.sensor
     lights = rig.lights if lights is None else lights
-    blur = float(np.hypot(sensor.psf_sigma_px, 1.0 / np.sqrt(12.0)))
     read = read_noise_e(sensor)
     outline, glint = np.empty(len(rig.cameras)), np.full((len(rig.cameras), len(lights)), np.inf)
     for k, camera in enumerate(rig.cameras):
@@ -101,6 +105,7 @@ def sensor_noise(
         radiance = iris_radiance(lit.values(), eye_mm, scene.spec.look.iris_albedo)
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
         dark = PUPIL_SHARE * iris
+        blur = blur_px(scene, camera, eye_mm)
         edge = edge_information(dark, iris, blur, read, sensor.full_well_e)
         outline[k] = 1.0 / np.sqrt(edge) if edge > 0 else np.inf
         for j, lamp in lit.items():
@@ -108,6 +113,25 @@ def sensor_noise(
             spread = float(np.hypot(blur, size))
             glint[k, j] = glint_deviation(energy, spread, dark, read, sensor.full_well_e)
     return FeatureNoise(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
+
+
+def blur_px(scene: Scene, camera: PinholeCamera, eye_mm: Floats) -> float:
+    """Compute the standard deviation (px) per axis of the blur of an eye's pupil: sensor, pixel, defocus and motion.
+
+    A disc of diameter c has the variance c^2 / 16 along each axis, a path of length l has l^2 / 12 along it.
+    """
+    sensor, motion = scene.spec.sensor, scene.spec.motion
+    pupil = eye_mm + np.array([-PUPIL_DEPTH_MM, 0.0, 0.0])
+    depth = float(camera.R[2] @ pupil + camera.t[2])
+    disc = 0.0 if scene.spec.lens.focus_mm is None else float(confusion_px(scene.spec.lens, camera, sensor, depth))
+    variance = sensor.psf_sigma_px**2 + 1.0 / 12.0 + disc**2 / 16.0
+    if motion is not None:
+        turn = np.radians(np.array([motion.eye_deg_s[0], motion.eye_deg_s[1]])) * ROTATION_MM
+        speed = np.array(motion.head_mm_s) + np.array([0.0, turn[0], turn[1]])
+        path = speed * sensor.time_ms * 1e-3
+        ends, _ = camera.project(np.stack([pupil - path / 2.0, pupil + path / 2.0]))
+        variance += float(np.sum((ends[1] - ends[0]) ** 2)) / 24.0
+    return float(np.sqrt(variance))
 
 
 def read_noise_e(sensor: Sensor) -> float:

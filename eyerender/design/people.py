@@ -6,8 +6,9 @@ Every person is calibrated at nine of the directions. The information about the 
 
 with the blocks A (frame), B and C (person) of each frame's information and its prior, is added to the information of
 every other single frame. The bound is that of the line of sight. Points of the outline and glints count if a ray
-reaches the camera, they lie on the sensor, and inside the projected inner margins of the lids. Lashes and frames are
-ignored.
+reaches the camera, they lie on the sensor, and the lids leave the ray free: it passes between their margins, which are
+as thick as those of the rendered lids. For a glint this holds for the light's way from the LED too. Lashes and frames
+are ignored.
 """
 
 from __future__ import annotations
@@ -18,15 +19,20 @@ from typing import Any
 
 import numpy as np
 
+from ..analytic.features import View
+from ..analytic.rays import glint_exits
 from ..base.arrays import ArrayValue, Bools, Floats, Indices, Ints
 from ..base.errors import InputError
-from ..eye.batch import structure_of
+from ..base.status import Status
+from ..eye.batch import structure_of, take_eyes
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
+from ..optics.transforms import normalize
 from ..population.people import Person
 from ..region.anatomy import Region
 from ..region.contour import inner_margins
 from ..region.globe import Globe
+from ..region.lids import EDGE_MM, LOWER_TILT_DEG, margin_width_mm
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
@@ -47,6 +53,8 @@ CALIBRATION_CELLS = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRA
 TOGETHER = 8
 _MARGIN_COLUMNS = 44
 _VAGUE, _LOST_DEG = 1e3, 60.0
+_ACROSS = (0.2, 0.8, 1.0)  # places across the margin, whose rounded edges are 0 and 1
+_EXACT_DEG = 1e-3  # noise of a fixation that adds nothing to the bound
 LOST = ("ray", "sensor", "lid")
 """Reasons for a missing glint: no ray (off the cornea), off the sensor, behind a lid."""
 
@@ -95,7 +103,9 @@ class Figures(ArrayValue):
 
     Attributes:
         subject: (p,) number of the person.
-        bound_deg: (p, 81) standard deviation of the line of sight after a calibration; inf if undetermined.
+        bound_deg: (p, 81) standard deviation of the line of sight after a calibration on targets that are fixated
+            exactly; inf if undetermined.
+        fixating_deg: (p, 81) the same with the noise of fixation during the calibration.
         noise_deg: (p, 81) the same for an exactly known person: the part that differs between frames.
         outline: (p, 81) visible share of the outline, in the camera that sees most.
         glints: (p, 81) number of lights whose glint is visible in any camera.
@@ -105,6 +115,7 @@ class Figures(ArrayValue):
 
     subject: Ints
     bound_deg: Floats
+    fixating_deg: Floats
     noise_deg: Floats
     outline: Floats
     glints: Ints
@@ -195,7 +206,7 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
         openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
         numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
         seen = [
-            visible(slopes_of(replace(instants, camera=number), theta, POINTS), camera, openings)[0]
+            _lids_apart(replace(instants, camera=number), theta, camera, openings)
             for number, camera in zip(numbers, rig.cameras, strict=True)
         ]
         for part, noise in zip(parts, noises, strict=True):
@@ -205,11 +216,28 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
     return [joined(part) for part in parts]
 
 
+def _lids_apart(views: Views, theta: Floats, camera: PinholeCamera, openings: Floats | None) -> FeatureSlopes:
+    lit = None if openings is None else mirror_points(views, theta)
+    return visible(slopes_of(views, theta, POINTS), camera, openings, lit, views.lights_mm)[0]
+
+
+def mirror_points(views: Views, theta: Floats) -> Floats:
+    """Compute where the cornea mirrors each light to the camera (n, m, 3) mm, in the world; NaN where it does not."""
+    eye = take_eyes(views.eyes, views.person)
+    camera = views.rig.cameras[int(views.camera[0])]
+    view = View.of(eye, Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), views.position_mm, camera)
+    exits, _, status = glint_exits(eye, 1, view.into_eye(views.lights_mm), view.camera_mm)
+    turn, shift = view.motion
+    points = np.einsum("nij,jnm->nmi", turn, np.stack(exits)) + shift[:, None]
+    return np.asarray(np.where((status == Status.OK)[..., None], points, np.nan))
+
+
 def _nobody(refused: list[int]) -> Figures:
     cells = GRID * GRID
     return Figures(
         subject=np.empty(0, np.int64),
         bound_deg=np.empty((0, cells)),
+        fixating_deg=np.empty((0, cells)),
         noise_deg=np.empty((0, cells)),
         outline=np.empty((0, cells)),
         glints=np.empty((0, cells), np.int64),
@@ -229,16 +257,20 @@ def _of_group(survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, peop
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
         slopes = slopes_of(views, case.theta, POINTS, free)
-        slopes, why = visible(slopes, camera, openings)
+        lit = None if openings is None else mirror_points(views, case.theta)
+        slopes, why = visible(slopes, camera, openings, lit, views.lights_mm)
         matrices += information_of_views(slopes, noise, views.camera)
         outline = np.maximum(outline, slopes.outline_ok.mean(axis=1))
         glints |= slopes.glint_ok
         lost += why
     cells = GRID * GRID
-    bound, alone = bounds(case, matrices, noise, Unknowns.from_mapping(survey.unknowns))
+    unknowns = Unknowns.from_mapping(survey.unknowns)
+    bound, alone = bounds(case, matrices, replace(noise, fixation_deg=_EXACT_DEG), unknowns)
+    fixating, _ = bounds(case, matrices, noise, unknowns)
     return Figures(
         subject=np.array([one.subject for one in people]),
         bound_deg=bound.reshape(-1, cells),
+        fixating_deg=fixating.reshape(-1, cells),
         noise_deg=alone.reshape(-1, cells),
         outline=outline.reshape(-1, cells),
         glints=glints.sum(axis=1).reshape(-1, cells),
@@ -262,7 +294,7 @@ def _case(survey: RigPopulation, rig: RigGeometry, people: list[Someone]) -> Cas
 
 
 def _openings(survey: RigPopulation, people: list[Someone]) -> Floats:
-    """Compute inner margins of the lids around the eye in the world, (i, columns, 3) mm.
+    """Compute lines along the lids' margins around the eye in the world, (i, len(_ACROSS), columns, 3) mm.
 
     They depend mostly on elevation, so they are computed at three azimuths and interpolated.
     """
@@ -283,22 +315,68 @@ def _openings(survey: RigPopulation, people: list[Someone]) -> Floats:
         )
         margins = inner_margins(one.region, globe, rigid_motion(poses, one.eye), _MARGIN_COLUMNS) + one.place_mm
         known = margins.reshape(GRID, len(CALIBRATION), -1)
-        out.append((shares @ known).reshape(GRID * GRID, _MARGIN_COLUMNS, 3))
+        inner = (shares @ known).reshape(GRID * GRID, _MARGIN_COLUMNS, 3)
+        out.append(_across_margin(inner, one))
     return np.concatenate(out)
 
 
-def visible(slopes: FeatureSlopes, camera: PinholeCamera, openings: Floats | None) -> tuple[FeatureSlopes, Ints]:
-    """Return the features that the lids leave visible, and the numbers (n, 3) of glints lost by reason (`LOST`)."""
+def _across_margin(inner_mm: Floats, one: Someone) -> Floats:
+    """Compute lines along the margins, (i, len(_ACROSS), c, 3), from their inner edges (i, c, 3) mm; lids are open."""
+    angle = 2.0 * np.pi * np.arange(inner_mm.shape[1]) / inner_mm.shape[1]
+    upper, lids = np.sin(angle) >= 0.0, one.region.lids
+    normal = normalize(inner_mm - (one.place_mm + one.eye.sclera.centre_mm))
+    up = np.array([0.0, 0.0, 1.0])
+    away = normalize(up - normal * normal[..., 2:]) * np.where(upper, 1.0, -1.0)[:, None]
+    tilt = np.radians(lids.margin_tilt_deg + np.where(upper, 0.0, LOWER_TILT_DEG))[:, None]
+    width = margin_width_mm(lids.margin_mm, angle, upper, 1.0)[:, None]
+    out = np.cos(tilt) * normal + np.sin(tilt) * away
+    round_mm = EDGE_MM * width / lids.margin_mm
+    return np.stack([inner_mm + width * u * out + round_mm * (2 * u - 1) ** 4 * away for u in _ACROSS], axis=1)
+
+
+def visible(
+    slopes: FeatureSlopes,
+    camera: PinholeCamera,
+    openings: Floats | None,
+    mirror_mm: Floats | None = None,
+    lights_mm: Floats | None = None,
+) -> tuple[FeatureSlopes, Ints]:
+    """Return the features that the lids leave visible, and the numbers (n, 3) of glints lost by reason (`LOST`).
+
+    Args:
+        slopes: the features of n views.
+        camera: the camera that sees them.
+        openings: (n, e, c, 3) mm, lines along the lids' margins that rays must pass; None: all is visible.
+        mirror_mm: (n, m, 3) mm, where the cornea mirrors each light.
+        lights_mm: (m, 3) mm, the lights.
+    """
     traced = np.isfinite(slopes.images.glints_px).all(axis=2)
     inside = np.where(traced, slopes.glint_ok, False)
     hidden_glints = np.zeros_like(inside)
     outline_ok = slopes.outline_ok
     if openings is not None:
-        pixels, _ = camera.project(openings)
-        outline_ok = outline_ok & inside_polygon(pixels, slopes.images.outline_px)
-        hidden_glints = inside & ~inside_polygon(pixels, slopes.images.glints_px)
+        passing = inside.copy()
+        for edge in np.moveaxis(openings, 1, 0):
+            pixels, _ = camera.project(edge)
+            outline_ok = outline_ok & inside_polygon(pixels, slopes.images.outline_px)
+            passing &= inside_polygon(pixels, slopes.images.glints_px)
+            if mirror_mm is not None and lights_mm is not None:
+                passing &= lit_through(edge, mirror_mm, lights_mm)
+        hidden_glints = inside & ~passing
     why = np.stack([(~traced).sum(axis=1), (traced & ~inside).sum(axis=1), hidden_glints.sum(axis=1)], axis=1)
     return replace(slopes, outline_ok=outline_ok, glint_ok=inside & ~hidden_glints), why
+
+
+def lit_through(edges_mm: Floats, points_mm: Floats, lights_mm: Floats) -> Bools:
+    """Return whether each light (m, 3) reaches its point (n, m, 3) through closed curves in space (n, c, 3), (n, m)."""
+    out = np.zeros(points_mm.shape[:2], dtype=bool)
+    for k, light in enumerate(lights_mm):
+        ahead = edges_mm.mean(axis=(0, 1)) - light
+        axes = np.linalg.svd(ahead[None])[2]  # the way ahead, and two axes across it
+        edge, point = ((places - light) @ axes.T for places in (edges_mm, points_mm[:, k : k + 1]))
+        flat = [places[..., 1:] / places[..., :1] for places in (edge, point)]
+        out[:, k] = inside_polygon(*flat)[:, 0]
+    return out
 
 
 def inside_polygon(polygon_px: Floats, points_px: Floats) -> Bools:

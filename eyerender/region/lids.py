@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Floats, frozen, sealed
+from ..base.arrays import ArrayValue, Bools, Floats, frozen, sealed
 from ..optics.vectors import crosses, dots, lengths
 from .anatomy import Region
 from .contour import LATERAL, Contour, canthi, contour, step, unit
@@ -34,6 +34,7 @@ ROWS = CONJUNCTIVA + MARGIN + LID + FACE
 FINE = CONJUNCTIVA + 1  # rows with a position in every column; the others have one in every second column
 _DIP_MM = 0.031
 EDGE_MM = 0.26  # depth of the margin's rounded edges
+LOWER_TILT_DEG = 16.0  # the upper margin faces down and is seen edge-on; the lower one opens upwards by so much more
 _FAR_MM = (66.0, 58.0)
 # Rows are dense at both ends of the lid: at the lash line for what is wet, at the crease for its fold.
 _LID_ROWS = np.array([1, 2, 3, 4, 6, 8, 10, 12, 13, 14, 15, 16]) / 16
@@ -122,15 +123,18 @@ def grid_normals(vertices: Floats) -> Floats:
 
 
 def margin_width(spec: Region, c: Contour) -> Floats:
-    """Compute the thickness (columns,) mm of the margin; the lower one is thinner (Zhu et al. 2022).
+    """Compute the thickness (columns,) mm of the margin of a contour."""
+    return margin_width_mm(spec.lids.margin_mm, c.angle, c.upper > 0, c.openness)
+
+
+def margin_width_mm(thickest_mm: float, angle: Floats, upper: Bools, openness: float) -> Floats:
+    """Compute the thickness (columns,) mm of the margin at angles about it; the lower one is thinner (Zhu et al. 2022).
 
     It decreases towards the canthi. The margins of closed lids are equally thick, so that neither overhangs the other's
     lashes.
     """
-    middle = spec.lids.margin_mm * np.where(c.upper > 0, 1.0, 1 - 0.2 * min(c.openness, 1.0))
-    return np.asarray(
-        0.45 * spec.lids.margin_mm + (middle - 0.45 * spec.lids.margin_mm) * step(np.abs(np.sin(c.angle)), 0.0, 0.55)
-    )
+    middle = thickest_mm * np.where(upper, 1.0, 1 - 0.2 * min(openness, 1.0))
+    return np.asarray(0.45 * thickest_mm + (middle - 0.45 * thickest_mm) * step(np.abs(np.sin(angle)), 0.0, 0.55))
 
 
 def _across() -> tuple[Floats, Floats]:
@@ -145,7 +149,7 @@ _ACROSS = _across()
 
 def _margin(spec: Region, globe: Globe, c: Contour) -> tuple[Floats, Floats]:
     # The upper margin faces down and is seen edge-on from the front; the lower one opens upwards.
-    tilt = np.radians(np.where(c.upper > 0, 0.0, 1.0) * 16.0 + spec.lids.margin_tilt_deg)[:, None]
+    tilt = np.radians(np.where(c.upper > 0, 0.0, LOWER_TILT_DEG) + spec.lids.margin_tilt_deg)[:, None]
     tilt = tilt * (0.25 + 0.75 * min(c.openness, 1.0))
     width = margin_width(spec, c)
     out = np.cos(tilt) * c.normal + np.sin(tilt) * c.away

@@ -50,10 +50,13 @@ def test_people_do_not_depend_on_their_pieces(survey):
     noise = sensor_noise(er.load_scene("head_mounted"))
     whole = figures_of(survey, noise, 0, 2)
     alone = figures_of(survey, noise, 1, 1)
-    assert alone.bound_deg[0] == pytest.approx(whole.bound_deg[1], rel=1e-9)
+    assert alone.fixating_deg[0] == pytest.approx(whole.fixating_deg[1], rel=1e-9)
+    assert alone.bound_deg[0] == pytest.approx(whole.bound_deg[1], rel=1e-6)  # exact targets: large numbers cancel
     assert (alone.glints[0] == whole.glints[1]).all()
     # Nine fixations with 0.3 deg per axis leave 0.3 sqrt(2) / 3 deg.
-    assert np.median(whole.bound_deg) == pytest.approx(0.1414, abs=0.005)
+    assert np.median(whole.fixating_deg) == pytest.approx(0.1414, abs=0.005)
+    assert (whole.noise_deg <= whole.bound_deg * (1 + 1e-6)).all()
+    assert np.median(whole.bound_deg) < 0.01
 
 
 def test_lids_hide_features_when_they_close(survey, monkeypatch):
@@ -97,9 +100,13 @@ def test_industry_figures():
     errors = np.ones((10, 100))
     errors[:, :10] = 3.0
     errors[9] = 7.0
-    assert users_of(errors) == {"U50E95": 3.0, "U95E95": 7.0}
+    assert users_of(errors) == {"U50E95": 3.0, "U95E95": 7.0, "dropout": 0.0}
     errors[9] = np.nan
-    assert users_of(errors) == {"U50E95": 3.0, "U95E95": None}
+    errors[:9, :5] = np.nan
+    assert users_of(errors) == {"U50E95": 3.0, "U95E95": 3.0, "dropout": pytest.approx(0.145)}
+    errors[:9, :10] = np.nan
+    assert users_of(errors)["U95E95"] == 1.0
+    assert users_of(errors * np.nan) == {"U50E95": None, "U95E95": None, "dropout": 1.0}
 
 
 def test_the_command_writes_a_report(tmp_path, capsys):

@@ -28,19 +28,24 @@ def test_three_leds_by_hand():
     )  # fmt: skip
     found = eye_exposure(leds, [0, 0, 0], wavelength_nm=850.0, box_mm=(3, 3, 3))
     # First: 13 - 3 = 10 mm, 0.96 mW/sr: 0.00096 / 0.01^2 = 9.6 W/m^2.
-    # Second: from (23, 24, 0) to (3, 3, 0): 20 and 21, so 29 mm, at a cosine of 21 / 29 from its axis (0, -1, 0).
-    cosine = 21 / 29
-    second = 0.005 * 0.25 * cosine**3 / 0.029**2
+    # Second: d below and 20 beside it, E ~ d^3 / (d^2 + 400)^(5/2): largest at d^2 = 600, not where it is nearest.
+    cosine, distance = math.sqrt(600 / 1000), math.sqrt(1000)
+    second = 0.005 * 0.25 * cosine**3 / (distance * 1e-3) ** 2
     # Third: 50 mm, isotropic.
-    assert found.distance_mm == pytest.approx([10, 29, 50], rel=1e-12)
+    assert found.distance_mm == pytest.approx([10, distance, 50], rel=1e-5)
     assert found.cornea_w_m2 == pytest.approx([9.6, second, 0.010 / 0.050**2], rel=1e-6)
     weight = 10 ** (-150 / 500)
     first_radiance = weight * 0.00096 / (math.pi * 0.15e-3**2)
-    second_radiance = weight * 0.005 * 0.25 * cosine**3 / (math.pi * (2.5e-3**2 - 0.5e-3**2) * cosine)
+    # L ~ cos^2, over a limit that is the same in the whole box: largest at the lowest and nearest place, (3, -3, 0).
+    steep = 27 / math.hypot(27, 20)
+    second_radiance = weight * 0.005 * 0.25 * steep**2 / (math.pi * (2.5e-3**2 - 0.5e-3**2))
     assert found.retina_w_m2_sr[:2] == pytest.approx([first_radiance, second_radiance], rel=1e-6)
-    # 0.3 mm at 10 mm are 0.03 rad; 5 mm at 29 mm are more than 0.1 rad, the largest that counts.
+    # 0.3 mm at 10 mm are 0.03 rad; 5 mm at 34 mm are more than 0.1 rad, the largest that counts.
     assert found.retina_limit_w_m2_sr[:2] == pytest.approx([6000 / 0.03, 6000 / 0.1], rel=1e-6)
     assert found.cornea_share == pytest.approx((9.6 + second + 4.0) / 100, rel=1e-6)
+    stuck = found.to_mapping()["stuck_on"]
+    assert stuck["cornea_share"] == pytest.approx((9.6 + 4 * second + 4.0) / 100, rel=1e-6)
+    assert stuck["retina_share"] == pytest.approx(max(first_radiance / 2e5, 4 * second_radiance / 6e4), rel=1e-6)
     assert np.isnan(found.retina_w_m2_sr[2])
     retina = found.to_mapping()["lights"][2]["retina"]
     assert retina.startswith("not known")

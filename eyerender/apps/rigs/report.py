@@ -20,7 +20,7 @@ from ...base.arrays import Floats, Ints, finite_or_none
 from ...base.errors import InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json
-from ...design.crowd import OUTLINE, SHIFTS_MM, coverage_of, figures_of_people, figures_of_shifts, users_of
+from ...design.crowd import SHIFTS_MM, coverage_of, covered, figures_of_people, figures_of_shifts, gaze_of, users_of
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, place_of
 from ...design.safety import NOTE, eye_exposure
@@ -86,16 +86,7 @@ def run_rig(
         InputError: the folder is not empty, or no drawn eye is physically possible.
     """
     whole, scene = scene, scene.of_first_eye()
-    survey = RigPopulation(
-        scene=scene.located().to_mapping(),
-        population=population.to_mapping(),
-        seed=size.seed,
-        azimuth_deg=size.azimuth_deg,
-        elevation_deg=size.elevation_deg,
-        slippage_mm=size.slippage_mm,
-        relief_mm=size.relief_mm,
-        unknowns=(Unknowns.population() if unknowns is None else unknowns).to_mapping(),
-    )
+    survey = survey_of(scene, population, size, unknowns)
     noise = sensor_noise(scene)
     with staged(output, overwrite=overwrite) as folder:
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
@@ -114,6 +105,20 @@ def run_rig(
         _write_gaze(folder / GAZE, survey, found)
         write_page(folder / REPORT, page_of(scene, survey, found, data))
     return data
+
+
+def survey_of(scene: Scene, population: Population, size: RigSize, unknowns: Unknowns | None = None) -> RigPopulation:
+    """Return the rig of a scene and the people in front of it, with the priors of a population by default."""
+    return RigPopulation(
+        scene=scene.located().to_mapping(),
+        population=population.to_mapping(),
+        seed=size.seed,
+        azimuth_deg=size.azimuth_deg,
+        elevation_deg=size.elevation_deg,
+        slippage_mm=size.slippage_mm,
+        relief_mm=size.relief_mm,
+        unknowns=(Unknowns.population() if unknowns is None else unknowns).to_mapping(),
+    )
 
 
 def estimator_errors(
@@ -202,6 +207,7 @@ def summary(
     except InputError as error:
         safety = {"note": NOTE, "reason": str(error)}
     lights = len(scene.rig.lights) * len(scene.rig.cameras)
+    seen = covered(found, min(2, len(scene.rig.lights)))
     return {
         "schema": SCHEMA,
         "scene": scene.name,
@@ -214,12 +220,11 @@ def summary(
             "outline_px": noise.outline_px.tolist(),
             "glint_px": [[finite_or_none(v) for v in row] for row in noise.glint_px],
         },
-        "bound_deg": {
-            "note": NOISE_ONLY, "median": finite_or_none(np.median(found.bound_deg)), **users_of(found.bound_deg)
+        "bound_deg": {"note": NOISE_ONLY, **gaze_of(found.bound_deg, seen)},
+        "bound_with_fixation_deg": {
+            "note": NOISE_ONLY, "fixation_deg": FIXATION_DEG, **gaze_of(found.fixating_deg, seen)
         },
-        "frame_to_frame_deg": {
-            "note": NOISE_ONLY, "median": finite_or_none(np.median(found.noise_deg)), **users_of(found.noise_deg)
-        },
+        "frame_to_frame_deg": {"note": NOISE_ONLY, **gaze_of(found.noise_deg, seen)},
         "coverage": coverage_of(found),
         "glints_missing": {
             name: float(found.lost[..., k].mean() / max(lights, 1)) for k, name in enumerate(LOST)
@@ -241,7 +246,7 @@ def _slippage_of(shifts_mm: Floats, found: Sequence[Figures]) -> list[dict[str, 
     return [
         {
             "shift_mm": shift.tolist(),
-            "noise_deg": finite_or_none(np.median(figures.noise_deg)),
+            "noise_deg": gaze_of(figures.noise_deg, covered(figures))["median"],
             "covered_2_glints": coverage_of(figures)["outline_and_2_glints"],
         }
         for shift, figures in zip(shifts_mm, found, strict=True)
@@ -254,9 +259,8 @@ def _write_people(path: Path, found: Figures) -> None:
         writer = csv.writer(file)
         writer.writerow(["subject", "bound_e95_deg", "frame_to_frame_e95_deg", "outline", "glints", "covered_2_glints"])
         for k, subject in enumerate(found.subject):
-            covered = (found.outline[k] >= OUTLINE) & (found.glints[k] >= 2)
             e95 = (np.quantile(v[k], 0.95, method="higher") for v in (found.bound_deg, found.noise_deg))
-            means = (found.outline[k].mean(), found.glints[k].mean(), covered.mean())
+            means = (found.outline[k].mean(), found.glints[k].mean(), covered(found)[k].mean())
             writer.writerow([subject, *(f"{value:.6g}" for value in (*e95, *means))])
 
 
@@ -282,7 +286,8 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
         Card(degrees_text(data["frame_to_frame_deg"]["U50E95"]), "noise of gaze, median person (U50E95, noise only)"),
         Card(degrees_text(data["bound_deg"]["U95E95"]),
              "after a calibration, 95th-percentile person (U95E95, noise only)"),
-        Card("not known" if cornea is None else f"{100 * cornea:.1f} %", f"of the corneal limit ({NOTE})"),
+        Card("not known" if cornea is None else f"{100 * cornea:.1f} %",
+             f"of the corneal limit ({NOTE}); " + ("" if cornea is None else f"{_stuck(data)} with LEDs stuck on")),
     ]  # fmt: skip
     sections = (
         _gaze_section(survey, found), _who_section(survey, found, data), _slippage_section(data), _bias_section(data),
@@ -294,7 +299,7 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
         "Everything but errors on images follows from ray optics.",
         "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
         "alone. What an estimator assumes wrongly about the eye comes on top. U50E95 and U95E95 are the median and the "
-        "95th-percentile person's 95th-percentile error over the directions.",
+        "95th-percentile person's 95th-percentile error over the directions that the rig covers.",
     ]
     return Page(f"Rig report: {scene.name}", lead, cards, sections)
 
@@ -302,7 +307,7 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
 def _answer(data: dict[str, Any]) -> str:
     """Say in a few sentences how good the rig is."""
     share, bound, noise = data["coverage"]["outline_and_2_glints"], data["bound_deg"], data["frame_to_frame_deg"]
-    fixation = np.sqrt(2.0 / len(CALIBRATION_CELLS)) * FIXATION_DEG
+    fixating = data["bound_with_fixation_deg"]
     parts = [f"In short: the rig sees two glints and 60 % of the pupil's outline in {100 * share:.1f} % of all cases."]
     if noise["U50E95"] is None:
         parts.append("For the median person, the features do not determine gaze in every direction.")
@@ -310,8 +315,9 @@ def _answer(data: dict[str, Any]) -> str:
         parts.append(f"The sensor's noise moves the gaze of the median person by {degrees_text(noise['U50E95'])}.")
     if bound["U50E95"] is not None:
         parts.append(
-            f"After a calibration on nine targets the bound is {degrees_text(bound['U50E95'])}, of which the noise of "
-            f"fixation alone is {degrees_text(float(fixation))}."
+            "After a calibration on nine targets that are fixated exactly the bound is "
+            f"{degrees_text(bound['U50E95'])}; with a fixation noise of {FIXATION_DEG}° per axis it is "
+            f"{degrees_text(fixating['U50E95'])}."
         )
     known = {name: one["U50E95"] for name, one in data["estimators"].items() if one["U50E95"] is not None}
     if known:
@@ -321,13 +327,13 @@ def _answer(data: dict[str, Any]) -> str:
 
 
 def _gaze_section(survey: RigPopulation, found: Figures) -> Section:
-    covered = (found.outline >= OUTLINE) & (found.glints >= 2)
+    seen = covered(found)
     most = max(int(found.glints.max()), 1)
     maps = (
         ("noise of gaze (median, deg; noise only)", np.median(found.noise_deg, axis=0), (None, None)),
         ("visible glints (mean)", found.glints.mean(axis=0), (0, most)),
         ("visible share of the outline (mean)", found.outline.mean(axis=0), (0, 1)),
-        ("people with 2 glints and 60 % of the outline", covered.mean(axis=0), (0, 1)),
+        ("people with 2 glints and 60 % of the outline", seen.mean(axis=0), (0, 1)),
     )  # fmt: skip
     a, e = survey.azimuth_deg, survey.elevation_deg
     drawn = []
@@ -341,12 +347,12 @@ def _gaze_section(survey: RigPopulation, found: Figures) -> Section:
 
 
 def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) -> Section:
-    covered = ((found.outline >= OUTLINE) & (found.glints >= 2)).mean(axis=1)
+    seen = covered(found).mean(axis=1)
     noise = np.quantile(found.noise_deg, 0.95, axis=1, method="higher")
-    worst = np.lexsort((-noise, covered))[:10]
+    worst = np.lexsort((-noise, seen))[:10]
     population = Population.from_mapping(survey.population)
     rows = [
-        [str(found.subject[k]), f"{100 * covered[k]:.0f} %", f"{found.glints[k].mean():.1f}",
+        [str(found.subject[k]), f"{100 * seen[k]:.0f} %", f"{found.glints[k].mean():.1f}",
          f"{100 * found.outline[k].mean():.0f} %", degrees_text(finite_or_none(noise[k])),
          *_traits_of(population.person(int(found.subject[k]), survey.seed))]
         for k in worst
@@ -356,7 +362,11 @@ def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) ->
         ["60 % of the outline", f"{100 * shares['outline']:.1f} %"],
         *([f"and at least {k} glints", f"{100 * shares[f'outline_and_{k}_glints']:.1f} %"] for k in (1, 2, 3)),
     ]
-    why = {"ray": "no ray: the mirror point is off the cornea", "sensor": "off the sensor", "lid": "behind a lid"}
+    why = {
+        "ray": "no ray: the mirror point is off the cornea",
+        "sensor": "off the sensor",
+        "lid": "behind a lid, for the camera or the LED",
+    }
     missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
     tables = [
         Table(["visible", "people x directions"], coverage, caption="Coverage."),
@@ -416,6 +426,10 @@ def _bias_section(data: dict[str, Any]) -> Section:
     return Section("What do estimators add?", text, *tables)
 
 
+def _stuck(data: dict[str, Any]) -> str:
+    return f"{100 * data['safety']['stuck_on']['cornea_share']:.1f} %"
+
+
 def _safety_section(data: dict[str, Any]) -> Section:
     safety = data["safety"]
     if "lights" not in safety:
@@ -427,8 +441,9 @@ def _safety_section(data: dict[str, Any]) -> Section:
         rows.append([str(light["light"]), f"{light['distance_mm']:.1f}", f"{light['cornea_w_m2']:.3g}", known])
     text = (
         f"All LEDs together: {safety['cornea_w_m2']:.3g} W/m² at the cornea, limit "
-        f"{safety['cornea_limit_w_m2']:g} W/m² (IEC 62471, ICNIRP 2013; long exposure), at the nearest "
-        f"place of an eye box of 3 mm about the eye. This is {NOTE}."
+        f"{safety['cornea_limit_w_m2']:g} W/m² (IEC 62471, ICNIRP 2013; long exposure), each at the worst place of an "
+        f"eye box of 3 mm about the eye. If a fault leaves the LEDs on, they reach {_stuck(data)} of the limit. "
+        f"This is {NOTE}."
     )
     head = ["LED", "distance (mm)", "cornea (W/m²)", "retina"]
     return Section("Eye safety", text, Table(head, rows, wide=(3,)))

@@ -19,7 +19,7 @@ from ...base.arrays import Bools, Floats, finite_or_none
 from ...base.progress import Progress
 from ...base.storage.files import csv_text, write_json, write_text
 from ...design.choice import SiteInformation, choose_lights, noise_of_some
-from ...design.crowd import OUTLINE, coverage_of, figures_of_people, users_of
+from ...design.crowd import coverage_of, covered, figures_of_people, gaze_of
 from ...design.noise import sensor_noise
 from ...design.people import GRID, LOST, Figures, RigPopulation, sites_seen
 from ...design.safety import eye_exposure
@@ -71,9 +71,7 @@ class RigResult:
             "lost_by_third": {name: thirds(self.lost, values) for name, values in traits.items()},
             "coverage": coverage_of(found),
             "glints_missing": dict(zip(LOST, found.lost.mean(axis=(0, 1)).tolist(), strict=True)),
-            "frame_to_frame_deg": {
-                "median": finite_or_none(np.median(found.noise_deg)), **users_of(found.noise_deg)
-            },
+            "frame_to_frame_deg": gaze_of(found.noise_deg, ~self.lost),
             "cornea_share": self.cornea_share,
             "leds": list(self.bought),
         }  # fmt: skip
@@ -129,7 +127,7 @@ def _result(layout: KnownLayout, people: int, workers: int | None, progress: Pro
     return RigResult(
         layout=layout,
         figures=found,
-        lost=(found.outline < OUTLINE) | (found.glints < needed),
+        lost=~covered(found, needed),
         bought=bought(survey, scene, min(_BUYERS, people)),
         cornea_share=eye_exposure(scene.rig, place, wavelength_nm=scene.spec.wavelength_nm).cornea_share,
     )

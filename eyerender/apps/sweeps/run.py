@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import Bools, finite_or_none
+from ...base.arrays import Bools
 from ...base.errors import EyerenderError, InputError
 from ...base.processes import process_pool
 from ...base.progress import Progress, Say, notify
 from ...base.storage.files import make_folder, read_json, write_json
 from ...base.storage.lock import final_lock, run_lock
 from ...design.choice import choose_lights, noise_of_some
-from ...design.crowd import coverage_of, users_of
+from ...design.crowd import coverage_of, covered, gaze_of
 from ...design.noise import sensor_noise
 from ...design.people import RigPopulation, figures_of, sites_seen
 from ...design.safety import eye_exposure
@@ -174,7 +174,8 @@ def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
     found = figures_of(survey, sensor_noise(scene), 0, spec.people)
     if not len(found.subject):
         raise InputError("no eye of this population is physically possible", path="population")
-    coverage = coverage_of(found)
+    coverage, seen = coverage_of(found), covered(found, min(2, len(scene.rig.lights)))
+    noise = gaze_of(found.noise_deg, seen)
     return {
         "number": layout.number,
         "values": dict(layout.values),
@@ -182,9 +183,9 @@ def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
         "chosen": list(chosen),
         "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
         "people": len(found.subject),
-        "frame_to_frame_deg": users_of(found.noise_deg),
-        "bound_deg": users_of(found.bound_deg),
-        "noise_deg": finite_or_none(np.median(found.noise_deg)),
+        "frame_to_frame_deg": noise,
+        "bound_deg": gaze_of(found.bound_deg, seen),
+        "noise_deg": noise["median"],
         "coverage": coverage,
         "dropout": 1.0 - coverage["outline_and_2_glints"],
         **_exposure(scene),
