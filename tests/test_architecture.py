@@ -239,14 +239,14 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 87450,  # what datasets teach by mistake, for those who train; files of other programs, for those who have films
+    "": 87860,  # what datasets teach by mistake, for those who train; files of other programs, for those who have films
     "analytic": 730,
-    "apps": 16690,  # two rigs compared, for their makers; dependences that teach something false, for data makers
+    "apps": 16760,  # two rigs compared, for their makers; dependences that teach something false, for data makers
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
-    "cli": 2620,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
+    "cli": 2635,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
     "dataset": 10040,  # growth that keeps old images readable; rounding of processors recorded; for long runs
-    "design": 2980,  # lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
+    "design": 3290,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
     "eye": 3220,
     "folders": 1840,  # videos: what is missing of damaged ones; files of other programs named, for their owners

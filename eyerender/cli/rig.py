@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from ..apps.rigs.options import RigSize
 from ..base.errors import InputError
 from .app import app
-from .options import Backend, OutputFolder, Overwrite, Result
+from .options import OutputFolder, Overwrite, Result
 from .output import emit, progress
 from .population import read_population
 
@@ -22,7 +22,7 @@ def rig(
     population: str = "adults",
     size: Annotated[RigSize, Parameter(name="*")] = RigSize(),
     unknowns: Path | None = None,
-    backend: Backend = "auto",
+    tolerances: Path | None = None,
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
@@ -37,21 +37,25 @@ def rig(
         scenes: Scene files or names of shipped ones: their rigs, sensors, first eyes and first head positions.
         population: adults, emmetropic_adults, myopes, children or elderly, or a YAML file with the keys of
             `population`.
+        tolerances: A YAML file of tolerances of cameras, LEDs and mirrors, before or after the user's calibration.
         unknowns: A YAML file with the keys of `er.Unknowns` (default: priors of a population, 3 mm of slippage).
     """
     from ..apps.rigs.compare import compare_rigs, text_of
     from ..apps.rigs.report import REPORT, run_rig
+    from ..design.tolerances import Tolerances
     from ..design.unknowns import Unknowns
     from ..scene import load_scene
 
     given = None if unknowns is None else Unknowns.load(unknowns)
+    allowed = None if tolerances is None else Tolerances.load(tolerances)
     everyone = read_population(population, "--population")
     if not scenes:
         raise InputError("needs a scene, or several to compare", source="SCENES")
     loaded = [load_scene(scene) for scene in scenes]
     if len(loaded) > 1:
-        if size.images or given is not None:
-            raise InputError("is for one rig", source="--images" if size.images else "--unknowns")
+        for option, value in (("--images", size.images), ("--unknowns", given), ("--tolerances", allowed)):
+            if value:
+                raise InputError("is for one rig", source=option)
         with progress("rig") as steps:
             compared = compare_rigs(loaded, everyone, size, output=output, overwrite=overwrite, progress=steps)
         emit(compared, text_of(compared) + (f"\n\nreport: {output / REPORT}" if output is not None else ""), json)
@@ -60,7 +64,7 @@ def rig(
         raise InputError("is needed for one rig", source="--output")
     with progress("rig") as steps:
         found = run_rig(
-            loaded[0], everyone, output, size, unknowns=given, backend=backend, overwrite=overwrite,
+            loaded[0], everyone, output, size, unknowns=given, tolerances=allowed, overwrite=overwrite,
             progress=steps,
         )  # fmt: skip
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
@@ -82,6 +86,14 @@ def _text(found: dict[str, Any]) -> str:
         f"U50E95 {degrees(fixating['U50E95'])}, U95E95 {degrees(fixating['U95E95'])}",
         f"2 glints and 60 % of the outline: {100 * covered:.1f} % of people x directions",
     ]
+    for one in found["tolerances"] or ():
+        lines.append(
+            f"{one['part']} {one['number']}, {one['quantity']} {one['sd']:g}, {one['when']} calibration: "
+            f"{degrees(one['gaze_deg'])}"
+        )
+    if found["units"] is not None:
+        units = found["units"]
+        lines.append(f"all tolerances: U50E95 {degrees(units['U50E95'])}, U95E95 {degrees(units['U95E95'])}")
     for name, one in found["estimators"].items():
         if one["U50E95"] is not None:
             lines.append(f"{name} on exact features: U50E95 {degrees(one['U50E95'])}")

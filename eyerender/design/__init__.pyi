@@ -7,5 +7,6 @@ from .information import Information as Information
 from .noise import FeatureNoise as FeatureNoise
 from .safety import Exposure as Exposure
 from .safety import eye_exposure as eye_exposure
+from .tolerances import Tolerances as Tolerances
 
 __all__: list[str]

@@ -13,7 +13,7 @@ are ignored.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -180,14 +180,25 @@ def figures_of(survey: RigPopulation, noise: FeatureNoise, first: int, count: in
     """Compute the figures of some people."""
     scene = Scene.of(SceneSpec.from_mapping(survey.scene))
     everyone, refused = people_of(survey, first, count)
+    groups = _groups(everyone)
+    return Figures.joined([_nobody(refused), *(_of_group(survey, scene.rig, noise, some) for some in groups)])
+
+
+def _groups(everyone: Sequence[Someone]) -> Iterator[list[Someone]]:
+    """Yield people whose eyes can be stacked, a few at a time."""
     kinds: dict[object, list[Someone]] = {}
     for one in everyone:
         kinds.setdefault(structure_of(one.eye), []).append(one)
-    parts = [_nobody(refused)]
     for same in kinds.values():
         for start in range(0, len(same), TOGETHER):
-            parts.append(_of_group(survey, scene.rig, noise, same[start : start + TOGETHER]))
-    return Figures.joined(parts)
+            yield same[start : start + TOGETHER]
+
+
+def cases_of(survey: RigPopulation, count: int) -> Iterator[tuple[Case, Floats | None]]:
+    """Yield cases of the first people, a few people in each, and the lids about their eyes (see `visible`)."""
+    rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
+    for some in _groups(people_of(survey, 0, count)[0]):
+        yield _case(survey, rig, some), _openings(survey, some) if survey.lids else None
 
 
 def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
@@ -395,29 +406,44 @@ def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns
 
     The second result is that of an exactly known person.
     """
-    prior, free = unknowns.precision(), unknowns.free()
-    prior = np.maximum(prior, _VAGUE**-2)  # so that a frame without features has an inverse
+    found = learned(case, matrices, noise, unknowns)
+    own = slice(0, found.frame)
+    slopes = gaze_slopes(case.instants, case.theta)[:, :, found.every]
+    return _deviation_deg(found.joint, slopes), _deviation_deg(found.joint[:, own, own], slopes[:, :, own])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Learned:
+    """Information after each person's calibration.
+
+    Attributes:
+        every: (u,) numbers of the free unknowns, first those of a frame, then those of the person.
+        frame: how many of them are a frame's.
+        joint: (i, u, u) information on them in each frame, with the calibration's on the person, equation (7).
+        blocks: the blocks A (r, f, f) and B (r, f, u - f) of the frames of the calibration, with the frame's priors.
+    """
+
+    every: Indices
+    frame: int
+    joint: Floats
+    blocks: tuple[Floats, Floats]
+
+
+def learned(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns) -> Learned:
+    """Calibrate each person, equation (7)."""
+    free = unknowns.free()
+    prior = np.maximum(unknowns.precision(), _VAGUE**-2)  # so that a frame without features has an inverse
     local, person = np.flatnonzero(free[:LOCAL]), LOCAL + np.flatnonzero(free[LOCAL:])
     every = np.concatenate([local, person])
     joint = matrices[:, every[:, None], every] + np.diag(np.where(every < LOCAL, prior[every], 0.0))
-    own = slice(0, len(local))
-    slopes = gaze_slopes(case.instants, case.theta)[:, :, every]
-    alone = _deviation_deg(joint[:, own, own], slopes[:, :, own])
-    shared = _learned(case, matrices, noise, (prior, local, person))
-    joint[:, len(local) :, len(local) :] += np.repeat(shared, GRID * GRID, axis=0)
-    return _deviation_deg(joint, slopes), alone
-
-
-def _learned(case: Case, matrices: Floats, noise: FeatureNoise, parts: tuple[Floats, Indices, Indices]) -> Floats:
-    """Compute the information (p, q, q) on each person after the calibration, including the prior, equation (7)."""
-    prior, local, person = parts
     rows = (GRID * GRID * np.arange(len(matrices) // GRID**2)[:, None] + CALIBRATION_CELLS).ravel()
     whole = matrices[rows] + target_information(case, noise, rows)
     a = whole[:, local[:, None], local] + np.diag(prior[local])
     b = whole[:, local[:, None], person]
-    learned = whole[:, person[:, None], person] - np.swapaxes(b, 1, 2) @ np.linalg.solve(a, b)
-    each = learned.reshape(-1, len(CALIBRATION_CELLS), len(person), len(person))
-    return np.asarray(np.diag(prior[person]) + each.sum(axis=1))
+    shared = whole[:, person[:, None], person] - np.swapaxes(b, 1, 2) @ np.linalg.solve(a, b)
+    each = shared.reshape(-1, len(CALIBRATION_CELLS), len(person), len(person)).sum(axis=1)
+    joint[:, len(local) :, len(local) :] += np.repeat(np.diag(prior[person]) + each, GRID * GRID, axis=0)
+    return Learned(every=every, frame=len(local), joint=joint, blocks=(a, b))
 
 
 def _deviation_deg(matrices: Floats, slopes: Floats) -> Floats:

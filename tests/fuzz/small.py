@@ -13,6 +13,12 @@ import numpy as np
 from tests.fuzz.reader import Reader, suppress_input
 
 
+_TOLERANCES = (
+    b"format: 1\ntolerances:\n- {part: led, number: 0, quantity: position_mm, sd: 0.1, when: after}\n"
+    b"- {part: camera, number: all, quantity: rotation_deg, sd: 2, when: before}\n"
+)
+
+
 def _seeds(*values: Any) -> Callable[[], list[bytes]]:
     return lambda: [json.dumps(value, indent=1).encode() for value in values]
 
@@ -21,6 +27,12 @@ def _unknowns(path: Path) -> Any:
     from eyerender.design.unknowns import Unknowns
 
     return Unknowns.load(path)
+
+
+def _tolerances(path: Path) -> Any:
+    from eyerender.design.tolerances import Tolerances
+
+    return Tolerances.load(path)
 
 
 def _population(path: Path) -> Any:
@@ -247,6 +259,7 @@ def _map_seeds() -> list[bytes]:
 
 STUDY = {"schema": "eyerender/study/1", "settings": {"study": 1}}
 SMALL: dict[str, Reader] = {
+    "tolerances": Reader("a.yaml", _tolerances, lambda: [_TOLERANCES]),
     "unknowns": Reader("a.yaml", _unknowns, lambda: [b"gaze_deg: unknown\npupil_mm: 0.5\nslippage_mm: known\n"]),
     "population": Reader("a.yaml", _population, lambda: [b"population:\n  preset: adults\n", b"preset: myopes\n"]),
     "population-table": Reader("a.yaml", _population_table, _population_table_seeds),

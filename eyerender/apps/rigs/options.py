@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ...backends.choose import BackendChoice
 from ...base.errors import InputError
 
 LIMITS = {
@@ -26,6 +27,7 @@ class RigSize:
         relief_mm: Additional standard deviation along x, for the eye relief of a headset (3 is a good choice).
         azimuth_deg: Half range of the directions of gaze, horizontally.
         elevation_deg: Half range of the directions of gaze, vertically.
+        backend: The render backend of the images.
     """
 
     people: int = 200
@@ -37,6 +39,7 @@ class RigSize:
     relief_mm: float = 0.0
     azimuth_deg: float = 20.0
     elevation_deg: float = 15.0
+    backend: BackendChoice = "auto"
 
     def __post_init__(self) -> None:
         for name, (low, high) in LIMITS.items():

@@ -20,13 +20,24 @@ from ...base.arrays import Floats, Ints, finite_or_none
 from ...base.errors import InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json
-from ...design.crowd import SHIFTS_MM, coverage_of, covered, figures_of_people, figures_of_shifts, gaze_of, users_of
+from ...design.crowd import (
+    OUTLINE,
+    SHIFTS_MM,
+    coverage_of,
+    covered,
+    figures_of_people,
+    figures_of_shifts,
+    gaze_of,
+    users_of,
+)
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, place_of
 from ...design.safety import NOTE, eye_exposure
+from ...design.tolerances import UNITS, Tolerances, axes_of, unit_errors
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import staged
 from ...gaze.estimate import ray_errors_deg
+from ...gaze.likelihood import GLINT_PX, OUTLINE_PX
 from ...gaze.store import choose_estimator
 from ...imaging.imageobserver import ImageObserver
 from ...optics.transforms import direction_of
@@ -45,6 +56,8 @@ REPORT, PEOPLE, GAZE, SUMMARY = "report.html", "people.csv", "gaze.csv", "summar
 ESTIMATORS = ("direction-regression", "hennessey", "guestrin-eizenman", "maximum-likelihood")
 NOISE_ONLY = "noise only"
 TRAITS = ("age", "lids open (mm)", "fissure wide (mm)", "pupils apart (mm)")
+UNIT_PEOPLE = 20
+"""People for the errors by tolerances."""
 _TARGET_MM = 1000.0
 _SLIPPING = 4
 
@@ -65,7 +78,7 @@ def run_rig(
     size: RigSize = RigSize(),
     *,
     unknowns: Unknowns | None = None,
-    backend: BackendChoice = "auto",
+    tolerances: Tolerances | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -78,15 +91,17 @@ def run_rig(
         output: the folder.
         size: number of people, and range of gaze.
         unknowns: the priors of the bound; default: `Unknowns.population()`.
-        backend: renders the images.
+        tolerances: deviations of units from the nominal rig, which the estimators know; for the first `UNIT_PEOPLE`.
         overwrite: replace the contents of the folder.
         progress: called with (people done, people in all, what).
 
     Raises:
-        InputError: the folder is not empty, or no drawn eye is physically possible.
+        InputError: the folder is not empty, no drawn eye is physically possible, or a tolerance is that of no part.
     """
     whole, scene = scene, scene.of_first_eye()
     survey = survey_of(scene, population, size, unknowns)
+    if tolerances is not None:
+        list(axes_of(Scene.of(SceneSpec.from_mapping(survey.scene)), tolerances))  # refuses parts that do not exist
     noise = sensor_noise(scene)
     with staged(output, overwrite=overwrite) as folder:
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
@@ -94,17 +109,34 @@ def run_rig(
             raise InputError("no eye of this population is physically possible", source="--population")
         biases = estimator_errors(survey, found.subject[: size.sample].tolist(), progress)
         pictured = estimator_errors(
-            survey, found.subject[: size.images].tolist(), progress, images=True, backend=backend
+            survey, found.subject[: size.images].tolist(), progress, images=True, backend=size.backend
         )
         slipped = figures_of_shifts(survey, noise, min(_SLIPPING, size.people), workers=size.workers)
         data = summary(scene, survey, found, biases, noise, whole.rig)
         data["estimators_on_images"] = _errors_of(pictured)
         data["slippage"] = _slippage_of(*slipped)
+        data |= tolerated(survey, tolerances, scene.rig, min(UNIT_PEOPLE, size.people))
         write_json(folder / SUMMARY, data)
         _write_people(folder / PEOPLE, found)
         _write_gaze(folder / GAZE, survey, found)
         write_page(folder / REPORT, page_of(scene, survey, found, data))
     return data
+
+
+def tolerated(survey: RigPopulation, tolerances: Tolerances | None, rig: RigGeometry, people: int) -> dict[str, Any]:
+    """Compute what each tolerance costs, and the errors of drawn units; nulls without tolerances.
+
+    The estimator weights features as `MaximumLikelihood` does.
+    """
+    if tolerances is None:
+        return {"tolerances": None, "units": None}
+    found = unit_errors(survey, tolerances, FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=rig), people, OUTLINE)
+    rows = tolerances.to_mapping()["tolerances"]
+    costs = found.by_tolerance(len(rows))
+    return {
+        "tolerances": [{**row, "gaze_deg": finite_or_none(cost)} for row, cost in zip(rows, costs, strict=True)],
+        "units": {"people": people, "units": UNITS, **users_of(found.of_units(survey.seed))},
+    }
 
 
 def survey_of(scene: Scene, population: Population, size: RigSize, unknowns: Unknowns | None = None) -> RigPopulation:
@@ -290,8 +322,8 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
              f"of the corneal limit ({NOTE}); " + ("" if cornea is None else f"{_stuck(data)} with LEDs stuck on")),
     ]  # fmt: skip
     sections = (
-        _gaze_section(survey, found), _who_section(survey, found, data), _slippage_section(data), _bias_section(data),
-        _safety_section(data),
+        _cost_section(data), _gaze_section(survey, found), _who_section(survey, found, data), _slippage_section(data),
+        _bias_section(data), _safety_section(data),
     )  # fmt: skip
     lead = [
         _answer(data),
@@ -324,6 +356,31 @@ def _answer(data: dict[str, Any]) -> str:
         best = min(known, key=lambda name: known[name])
         parts.append(f"The best estimator, {best}, has model errors of {degrees_text(known[best])}.")
     return " ".join(parts)
+
+
+def _cost_section(data: dict[str, Any]) -> Section:
+    """What costs how much, in one table: noise, tolerances, and what estimators assume wrongly."""
+    people = str(data["people"])
+    rows = [
+        ["noise between frames", degrees_text(data["frame_to_frame_deg"]["median"]), people],
+        ["noise, after a calibration with exact fixation", degrees_text(data["bound_deg"]["median"]), people],
+        ["noise, with that of fixation", degrees_text(data["bound_with_fixation_deg"]["median"]), people],
+    ]
+    for one in data["tolerances"] or ():
+        part = f"{one['part']} {one['number']}" if one["number"] != "all" else f"every {one['part']}"
+        what = f"{part}: {one['quantity']} {one['sd']:g} {one['when']} calibration"
+        rows.append([what, degrees_text(one["gaze_deg"]), str(data["units"]["people"])])
+    if data["units"] is not None:
+        units = data["units"]
+        text = f"U50E95 {degrees_text(units['U50E95'])}, U95E95 {degrees_text(units['U95E95'])}"
+        rows.append([f"all tolerances, {units['units']} drawn units for each person", text, str(units["people"])])
+    for name, one in data["estimators"].items():
+        if one["U50E95"] is not None:
+            rows.append([f"{name}, on exact features", f"U50E95 {degrees_text(one['U50E95'])}", str(one["people"])])
+    caption = (
+        "Standard deviations of the direction of gaze (median over people and directions) where nothing else is said."
+    )
+    return Section("What costs how much?", Table(["cause", "gaze", "people"], rows, caption=caption, wide=(0,)))
 
 
 def _gaze_section(survey: RigPopulation, found: Figures) -> Section:
