@@ -12,7 +12,6 @@ import numpy as np
 
 from tests.fuzz.reader import Reader, suppress_input
 
-
 _TOLERANCES = (
     b"format: 1\ntolerances:\n- {part: led, number: 0, quantity: position_mm, sd: 0.1, when: after}\n"
     b"- {part: camera, number: all, quantity: rotation_deg, sd: 2, when: before}\n"
