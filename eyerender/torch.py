@@ -6,7 +6,7 @@ Both datasets yield each image as a mapping with the requested parts:
 
 | part | value |
 |---|---|
-| `image`, `noiseless` | float32 (1, h, w): linear counts as a share of the full scale, 0 to 1 |
+| `image`, `noiseless` | float32 (1, h, w): codes of the camera as a share of the full scale, 0 to 1 |
 | `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the view |
 | `highlight_mask` | int64 (h, w): 1 where wet and oily surfaces mirror a lamp |
 | `instance_mask` | int64 (h, w): as `mask`, with 5 skin, 6 upper lid, 7 lower lid, 8 lashes, 9 brow, 10 caruncle |
@@ -19,8 +19,9 @@ Both datasets yield each image as a mapping with the requested parts:
 | `line` | the whole line of metadata, a dict |
 
 Pictures of any bit depth become shares of the full scale, so folders of different sensors can be joined; with `size`,
-those of different cameras, too. Every mapping also has `sample` and `subject`, the numbers of the sample and of its
-subject. Folders that `render` wrote have only pictures and lines.
+those of different cameras, too. With `encoding="stored"`, the default, they are the codes that the camera stored, as in
+a recorded picture; `linear` undoes the camera's gamma. Every mapping also has `sample` and `subject`, the numbers of
+the sample and of its subject. Folders that `render` wrote have only pictures and lines.
 """
 
 from __future__ import annotations
@@ -114,6 +115,7 @@ class FolderDataset(Dataset[Any]):
         group: `sample` yields the images of one sample (all cameras and eyes of one instant) together: each part is
             stacked as in a batch, and a list where the sizes differ.
         transform: called with the mapping of each image or group; what it returns takes the mapping's place.
+        encoding: `stored` gives the camera's codes, `linear` undoes its gamma; both as shares of the full scale.
 
     Raises:
         InputError: the folder cannot be read, a part is unknown, or the folder has no such split. A wrong or missing
@@ -129,9 +131,11 @@ class FolderDataset(Dataset[Any]):
         size: tuple[int, int] | None = None,
         group: Literal["sample"] | None = None,
         transform: Transform | None = None,
+        encoding: Literal["stored", "linear"] = "stored",
     ) -> None:
         self.folder = ImageFolder.load(path)
         self.parts = _checked(parts)
+        self.encoding = _checked_encoding(encoding)
         self.size = _checked_size(size)
         self.transform = transform
         self.rows = np.arange(len(self.folder))
@@ -158,7 +162,7 @@ class FolderDataset(Dataset[Any]):
     def _image(self, row: int) -> dict[str, Any]:
         entry = self.folder.entries[row]
         where = f"{entry.source}: line {entry.number}"
-        item = _item(self.parts, entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
+        item = _item(self, entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
         return item if self.size is None else _fitted(item, entry.window[2:], self.size)
 
 
@@ -197,6 +201,7 @@ class StreamDataset(IterableDataset[Any]):
         ranks: number of ranks; by default that of torch.distributed.
         parts: keys of each item, from the table of this module.
         transform: called with the mapping of each image; it must return a mapping.
+        encoding: as for `FolderDataset`.
         backend: as for `eyerender.generate`.
         threads: processor threads of each worker; by default the workers share all that the process may use.
 
@@ -220,11 +225,13 @@ class StreamDataset(IterableDataset[Any]):
         ranks: int | None = None,
         parts: Sequence[str] = ("image", "mask"),
         transform: Transform | None = None,
+        encoding: Literal["stored", "linear"] = "stored",
         backend: BackendChoice = "auto",
         threads: int | None = None,
     ) -> None:
         self.plan = Plan.load(spec, eye=eye, seed=seed, count=count)
         self.parts = _checked(parts)
+        self.encoding = _checked_encoding(encoding)
         self.samples = _samples(self.plan, split)
         together = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = (torch.distributed.get_rank() if together else 0) if rank is None else rank
@@ -328,7 +335,7 @@ class StreamDataset(IterableDataset[Any]):
             threads = self.threads or max(1, usable_cpus() // workers)
             self._maker = Maker(self.plan, self.frames, backend=self.backend, threads=threads)
         for image in self._maker.make(index).images:
-            item = _item(self.parts, image.line, image.pictures.get, f"sample {index}")
+            item = _item(self, image.line, image.pictures.get, f"sample {index}")
             yield item if self.transform is None else self.transform(item)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -361,23 +368,27 @@ def _samples(plan: Plan, split: str | None) -> Sequence[int]:
 
 
 def _item(
-    parts: Sequence[str], line: dict[str, Any], picture: Callable[[str], NDArray[Any] | None], where: str
+    data: FolderDataset | StreamDataset,
+    line: dict[str, Any],
+    picture: Callable[[str], NDArray[Any] | None],
+    where: str,
 ) -> dict[str, Any]:
     item: dict[str, Any] = {}
+    gamma = float(line.get("gamma") or 1.0) if data.encoding == "linear" else 1.0
     try:
-        for part in parts:
-            item[part] = _value(part, line, picture)
+        for part in data.parts:
+            item[part] = _value(part, line, picture, gamma)
         return item | {key: line[key] for key in ("sample", "subject") if line.get(key) is not None}
     except WRONG as error:
         raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
 
 
-def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any] | None]) -> Any:
+def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any] | None], gamma: float) -> Any:
     if part in _PICTURES:
         pixels = picture(_PICTURES[part])
         if pixels is None:
             raise KeyError(_PICTURES[part])
-        return _tensor(part, pixels, line)
+        return _tensor(part, pixels, line["bit_depth"], gamma)
     if part in ("pupil", "iris"):
         ellipse, window = line["labels"][part]["amodal"], line["window_px"]
         if ellipse["centre_px"] is None:
@@ -390,8 +401,8 @@ def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any
     return others[part](line) if part in others else line
 
 
-def _tensor(part: str, pixels: NDArray[Any], line: dict[str, Any]) -> torch.Tensor:
-    """Convert the pixels of a picture."""
+def _tensor(part: str, pixels: NDArray[Any], bit_depth: int, gamma: float) -> torch.Tensor:
+    """Convert the pixels of a picture; counts become shares of the full scale, to the power of a gamma."""
     if part.endswith("mask"):
         return torch.from_numpy(pixels.astype(np.int64))
     values = np.array(pixels, dtype=np.float32)
@@ -399,8 +410,7 @@ def _tensor(part: str, pixels: NDArray[Any], line: dict[str, Any]) -> torch.Tens
         array = torch.from_numpy(values)
         return array[None] if array.ndim == 2 else array.permute(2, 0, 1).contiguous()
     if pixels.dtype.kind == "u":
-        values /= 2 ** line["bit_depth"] - 1
-        gamma = line.get("gamma") or 1.0
+        values /= 2**bit_depth - 1
         values = values if gamma == 1 else values**gamma
     return torch.from_numpy(values)[None]
 
@@ -436,6 +446,12 @@ def _camera(line: dict[str, Any]) -> dict[str, Any]:
     K[1, 2] -= window["y0"]
     numbers = {key: torch.tensor(own[key], dtype=torch.float32) for key in ("R", "t_mm", "distortion")}
     return {"index": int(line["parameters"]["camera"]), "K": K, **numbers}
+
+
+def _checked_encoding(encoding: str) -> str:
+    if encoding not in ("stored", "linear"):
+        raise InputError(f"must be 'stored' or 'linear', not {encoding!r}", path="encoding")
+    return encoding
 
 
 def _checked_size(size: tuple[int, int] | None) -> tuple[int, int] | None:

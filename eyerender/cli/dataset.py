@@ -234,7 +234,7 @@ def export_dataset(
         "teyed",
     ],
     bits: Literal[8, 16] = 8,
-    encoding: Literal["linear", "gamma"] | None = None,
+    encoding: Literal["stored", "linear", "gamma"] | None = None,
     gain: float | None = None,
     workers: AtLeastOne = 1,
     shuffle: int | None = None,
@@ -247,8 +247,10 @@ def export_dataset(
         folder: A folder written by generate.
         format: The layout.
         bits: Bits per pixel of the images: 8, or 16 for webdataset, imagefolder, coco, csv and parquet.
-        encoding: Linear, or with a gamma of 2.2 (default: gamma for 8 bits, linear for 16 bits).
-        gain: Exposure gain of all images (default: measured on a sample of the images; 1 for 16-bit linear images).
+        encoding: The codes as the camera stored them, linear, or with a gamma of 2.2 (default: as stored if the dataset
+            has 8 bits; else gamma for 8 bits, linear for 16 bits).
+        gain: Exposure gain of linear or gamma images (default: measured on a sample of the images; 1 for 16-bit linear
+            images).
         workers: Number of processes that read and encode images. The bytes do not depend on it.
         shuffle: Write the images in a random order with this seed, instead of that of the samples (not teyed, labels).
     """
@@ -269,7 +271,8 @@ def export_dataset(
         )
     text = f"{done['images']} images as {format} in {output}"
     if image := done["image"]:  # the layout labels has none
-        text += f" ({bits} bits, {image['encoding']}, gain {image['gain']:g})"
+        gained = "" if image["encoding"] == "stored" else f", gain {image['gain']:g}"
+        text += f" ({bits} bits, {image['encoding']}{gained})"
     emit(done, text, json)
     return 0
 

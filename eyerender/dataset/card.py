@@ -134,7 +134,8 @@ made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jso
 
 ## Reading the images
 The images are PNG files of `bit_depth` bits, 16 unless the spec says otherwise. They hold linear sensor counts where
-`gamma` is 1; otherwise count / full scale = linear^(1 / gamma).
+`gamma` is 1; otherwise count / full scale = linear^(1 / gamma). `eyerender.torch` gives the codes as stored here, and
+so does `eyerender export-dataset` for images of 8 bits (`encoding: stored`).
 {WHOLE}
 {IMAGEFOLDER}
 ## Conventions

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import io
 import json
 import re
+import tarfile
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -16,6 +21,7 @@ from eyerender.dataset.export import FORMATS, Encoding, export
 from eyerender.dataset.export.encoding import measured_gain
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder
+from tests.support.dataset_specs import make_or_skip, plan
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -70,7 +76,8 @@ def test_the_gain_looks_at_most_pixels_and_not_at_the_brightest():
     ("options", "words"),
     [
         ({"bits": 12}, "--bits: must be 8 or 16"),
-        ({"encoding": "log"}, "--encoding: must be linear or gamma"),
+        ({"encoding": "log"}, "--encoding: must be one of stored, linear, gamma"),
+        ({"encoding": "stored", "gain": 2.0}, "--gain: codes as stored have none"),
         ({"gain": 0.0}, "--gain: must be 0.001 to 100000"),
         ({"gain": float("nan")}, "--gain: must be 0.001 to 100000"),
     ],
@@ -194,3 +201,98 @@ def test_the_cards_code_reads_sixteen_bits(tiny, tmp_path):
     (sample,) = (s for s in names["samples"] if s["__key__"] == entry.path.stem)
     np.testing.assert_array_equal(sample["png"], wanted)
     np.testing.assert_array_equal(sample["mask.png"], read_image(entry.mask_path)[0])
+
+
+@pytest.fixture(scope="module")
+def cameras(tmp_path_factory):
+    """Twelve subjects, each before a camera with its own gamma and JPEG compression."""
+    changes = {
+        "count": 12, "subjects": 12, "scene.sensor.bit_depth": 8,
+        "scene.sensor.gamma": {"draw": "uniform", "per": "subject", "low": 1.0, "high": 2.2},
+        "scene.sensor.jpeg_quality": {"draw": "choice", "per": "subject", "values": [None, 90, 45]},
+    }  # fmt: skip
+    return make_or_skip(tmp_path_factory.mktemp("cameras") / "made", plan(**changes))
+
+
+def grey(file):
+    """A picture as Pillow converts it for common loaders."""
+    return np.asarray(Image.open(file).convert("RGB"))[..., 0]
+
+
+def in_tars(folder):
+    for tar in folder.glob("*.tar"):
+        with tarfile.open(tar) as file:
+            for name in (n for n in file.getnames() if n.count(".") == 1 and n.endswith(".png")):
+                yield grey(io.BytesIO(file.extractfile(name).read()))
+
+
+def in_tables(folder):
+    from pyarrow.parquet import read_table
+
+    for file in (folder / "data").iterdir():
+        rows = read_table(file, columns=["image"]).to_pylist()
+        yield from (grey(io.BytesIO(row["image"]["bytes"])) for row in rows)
+
+
+def in_archives(folder):
+    import h5py
+
+    for file in (folder / "All").iterdir():
+        with h5py.File(file) as opened:
+            yield from opened["Images"][:]
+
+
+def in_videos(folder):
+    for file in (folder / "VIDEOS").iterdir():
+        stream = cv2.VideoCapture(str(file))
+        while (frame := stream.read())[0]:
+            yield frame[1][..., 0]
+
+
+def in_files(folder):
+    return (grey(file) for file in folder.rglob("*.png") if "mask" not in file.parent.name)
+
+
+READERS = {"webdataset": in_tars, "parquet": in_tables, "ellseg": in_archives, "teyed": in_videos}
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("format", [f for f in FORMATS if f != "labels"])
+def test_eight_bit_pictures_keep_the_codes_of_their_camera(cameras, tmp_path, format):
+    """Whatever the camera's gamma and compression, every layout has the stored codes, and its card says so."""
+    done = export(cameras, format, tmp_path / "out")
+    stored = [entry.image() for entry in ImageFolder.load(cameras)]
+
+    def digests(pictures):
+        return sorted(hashlib.sha256(p.tobytes()).hexdigest() for p in pictures)
+
+    assert digests(READERS.get(format, in_files)(tmp_path / "out")) == digests(stored)
+    assert len(set(digests(stored))) == 12
+    image = done["image"]
+    assert (image["bits"], image["encoding"], image["gamma"], image["gain"]) == (8, "stored", None, 1.0)
+    assert "Encoding `stored`" in (tmp_path / "out" / "README.md").read_text()
+
+
+@pytest.mark.render
+def test_each_row_states_the_gamma_of_its_camera(cameras, tmp_path, capsys):
+    assert run(["export-dataset", str(cameras), str(tmp_path / "out"), "--format", "csv"]) == 0
+    assert "(8 bits, stored)" in capsys.readouterr().out
+    with open(tmp_path / "out" / "labels.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    entries = {entry.path.name: entry for entry in ImageFolder.load(cameras)}
+    for row in rows:
+        assert float(row["gamma"]) == entries[row["file_name"].split("/")[1]].gamma
+        assert (row["bit_depth"], row["encoding"], row["source_bit_depth"]) == ("8", "stored", "8")
+    # Asked for, the old encodings are there: a gain needs one.
+    assert export(cameras, "csv", tmp_path / "gamma", gain=2.0)["image"]["encoding"] == "gamma"
+    argv = ["export-dataset", str(cameras), "-o", str(tmp_path / "no"), "--format", "csv", "--encoding", "stored"]
+    assert run([*argv, "--gain", "2"]) == 2
+    assert "--gain: codes as stored have none" in capsys.readouterr().err
+
+
+def test_counts_of_more_bits_are_stored_as_they_are_or_scaled_to_eight():
+    counts = np.arange(4096, dtype=np.uint16).reshape(64, 64)
+    assert Encoding(16, "stored", 1.0, "none").apply(counts, 12, 1.8) is counts
+    eight = Encoding(8, "stored", 1.0, "none").apply(counts, 12, 1.8)
+    np.testing.assert_array_equal(eight, np.round(255 * (counts / 4095)))
+    assert eight.dtype == np.uint8

@@ -125,3 +125,22 @@ def test_a_stream_mixes_the_images_of_several_batches(spec):
     assert begun + [batch["sample"].tolist() for batch in resumed] == batches(shuffle=3)
     with pytest.raises(InputError, match="shuffle: is 3 in the state, but 0 here"):
         StreamDataset(spec, batch_size=4, parts=()).load_state_dict(stream.state_dict())
+
+
+def test_pictures_have_the_codes_of_their_camera(tmp_path):
+    """Unless the camera's gamma is to be undone; a folder and a stream agree."""
+    drawn = {"draw": "uniform", "per": "subject", "low": 1.2, "high": 2.2}
+    own = plan(**{"count": 4, "scene.sensor.bit_depth": 8, "scene.sensor.gamma": drawn})
+    make(tmp_path / "made", own)
+    for encoding in ("stored", "linear"):
+        data = FolderDataset(tmp_path / "made", encoding=encoding)
+        streamed = torch.cat([batch["image"] for batch in StreamDataset(own, batch_size=4, encoding=encoding)])
+        for item, entry, other in zip(data, ImageFolder.load(tmp_path / "made"), streamed, strict=True):
+            share = entry.image().astype(np.float32) / 255
+            wanted = share if encoding == "stored" else share**entry.gamma
+            np.testing.assert_array_equal(item["image"][0], wanted)
+            np.testing.assert_array_equal(other[0], wanted)
+    assert torch.equal(FolderDataset(tmp_path / "made")[0]["image"], FolderDataset(
+        tmp_path / "made", encoding="stored")[0]["image"])  # fmt: skip
+    with pytest.raises(InputError, match="encoding: must be 'stored' or 'linear', not 'gamma'"):
+        FolderDataset(tmp_path / "made", encoding="gamma")

@@ -1,8 +1,8 @@
 """Exports of generated datasets in the layouts that existing training code reads.
 
-Positions are in pixels of the image (the window), with pixel centres at integers. The images have 8 bits and a gamma of
-2.2 with one exposure gain for the whole export, unless requested otherwise (`encoding`); `export.json` and `README.md`
-state this.
+Positions are in pixels of the image (the window), with pixel centres at integers. Images of 8 bits keep the codes that
+the camera stored; others get 8 bits and a gamma of 2.2 with one exposure gain for the whole export, unless requested
+otherwise (`encoding`). `export.json` and `README.md` state this.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from ...folders.outfolder import staged
 from ..assemble import verify_dataset
 from . import coco, ellseg, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
-from .encoding import RAW, SAMPLED, Curve, Encoding, check, measured_gain
+from .encoding import SAMPLED, STORED, Curve, Encoding, check, measured_gain
 from .item import Item, Items, wrong_labels
 
 # Returns the head of README.md, or None.
@@ -73,8 +74,10 @@ def export(
         format: one of `FORMATS`.
         out: the folder to write.
         bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
-        encoding: `linear` or `gamma`; by default gamma for 8 bits, linear for 16.
-        gain: factor for all values; by default 1 for 16 bits linear, otherwise measured on a sample of the images.
+        encoding: `stored` (the codes of the camera), `linear` or `gamma`; by default stored for images of 8 bits
+            without a `gain`, else gamma for 8 bits and linear for 16.
+        gain: factor for all values of `linear` and `gamma`; by default 1 for 16 bits linear, otherwise measured on a
+            sample of the images.
         workers: number of processes that read and encode the images; the bytes do not depend on it.
         shuffle: seed of a random order of the images; by default they are in the order of the samples. It is refused
             for `teyed` and `labels`, which have an order of their own.
@@ -104,7 +107,7 @@ def export(
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
         if format not in _PICTURELESS:
-            items.encoding = _encoding(items, bits, encoding or ("gamma" if bits == 8 else "linear"), gain)
+            items.encoding = _encoding(items, bits, encoding, gain)
         head = FORMATS[format](items, stage) or ""
         done = {
             "schema": SCHEMA,
@@ -114,10 +117,10 @@ def export(
             "unfinished": bool(folder.unfinished),
             "images_by_split": items.images_by_split,
             "source_bit_depths": sorted(items.bit_depths),
-            "image": None if format in _PICTURELESS else items.encoding.to_mapping(),
+            "image": None if format in _PICTURELESS else items.encoding.to_mapping(items.gammas),
         }
         layout = sys.modules[FORMATS[format].__module__].__doc__ or ""
-        write_text(stage / CARD, head + export_card(items.name, done, layout, items.encoding), sync=False)
+        write_text(stage / CARD, head + export_card(items.name, done, layout), sync=False)
         write_json(stage / EXPORT, done, sync=False)
     return {**done, "path": str(out)}
 
@@ -141,11 +144,16 @@ def _check_options(format: str, bits: int, encoding: Curve | None, gain: float |
         raise InputError(_ORDERED[format], source="--shuffle")
 
 
-def _encoding(items: Items, bits: int, curve: Curve, gain: float | None) -> Encoding:
+def _encoding(items: Items, bits: int, curve: Curve | None, gain: float | None) -> Encoding:
+    if curve is None:
+        eight = "stored" if gain is None and max(items.bit_depths) <= 8 else "gamma"
+        curve = "linear" if bits == 16 else eight
+    if curve == "stored":
+        return replace(STORED, bits=bits)
     if gain is not None:
         return Encoding(bits, curve, float(gain), "given")
     if curve == "linear" and bits == 16:
-        return RAW
+        return replace(STORED, curve="linear")
     measured = measured_gain((item.image, item.bit_depth, item.entry.gamma) for item in items.sample(SAMPLED))
     return Encoding(bits, curve, measured, "measured")
 

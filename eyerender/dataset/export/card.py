@@ -6,7 +6,7 @@ from typing import Any
 
 from ..card import WEBDATASET, WHOLE
 from . import gaze
-from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE, Encoding
+from .encoding import LARGEST_GAIN, LEVEL, SAMPLED, SHARE
 
 _GAINS = {
     "measured": f"""\
@@ -26,10 +26,10 @@ _GAZE = {
 }
 
 
-def export_card(name: str, done: dict[str, Any], layout: str, encoding: Encoding) -> str:
+def export_card(name: str, done: dict[str, Any], layout: str) -> str:
     """Return the text of README.md; `layout` describes the files."""
     splits = "\n".join(f"| {split} | {count} |" for split, count in done["images_by_split"].items())
-    values = "" if done["image"] is None else _values(done, encoding)
+    values = "" if done["image"] is None else _values(done, done["image"])
     return f"""# {name}: {done["format"]}
 
 {done["images"]} synthetic near-infrared images of eyes with exact labels, exported from the dataset "{name}".
@@ -45,22 +45,29 @@ README.md of the dataset explains how they were made and what the labels mean.
 {values}"""
 
 
-def _values(done: dict[str, Any], encoding: Encoding) -> str:
+def _values(done: dict[str, Any], image: dict[str, Any]) -> str:
     """Describe the values of the images, and how to decode them."""
-    image = encoding.to_mapping()
+    if image["encoding"] == "stored":
+        gamma = "several gammas" if image["gamma"] is None else f"a gamma of {image['gamma']:g}"
+        return f"""## Values of the images
+Encoding `stored`: each pixel has the code that its camera stored, so the cameras' tone curves ({gamma}) are still in
+the pictures. For the linear share of full scale, use `--encoding linear`, or bit depth and gamma of each image:
+
+    {image["inverse"]}
+"""
     depths = " or ".join(str(depth) for depth in done["source_bit_depths"])
     read = ""
-    if encoding.bits == 16:
+    if image["bits"] == 16:
         read = f"\n## Reading 16 bits\n{WHOLE}{WEBDATASET if done['format'] == 'webdataset' else ''}"
     return f"""## Values of the images
-The images have {encoding.bits} bits, encoding `{encoding.curve}`, and one exposure gain of {encoding.gain:g}.
-{_GAINS[encoding.gain_from]}
+The images have {image["bits"]} bits, encoding `{image["encoding"]}`, and one exposure gain of {image["gain"]:g}.
+{_GAINS[image["gain_from"]]}
 Images of two exports have the same scale only if their gains are the same (`--gain`).
 
     {image["formula"]}
     {image["inverse"]}
 
 `s` is the count of the sensor as a share of the full scale: s = count / (2^bits - 1), with {depths} bits in the
-dataset. The inverse is exact to half a code, except where the image was clipped at {2**encoding.bits - 1}.
+dataset. The inverse is exact to half a code, except where the image was clipped at {2 ** image["bits"] - 1}.
 `export.json` holds the same values for programs.
 {read}"""

@@ -82,7 +82,8 @@ def _annotated(item: Item, lights: int) -> _Annotated:
     mask, line = item.mask, item.line
     h, w = mask.shape
     size = {"width": w, "height": h}
-    about = {"subject": line["subject"], **item.camera, **_gaze(line)}
+    values = item.encoding.of_image(item.bit_depth, item.entry.gamma)
+    about = {"subject": line["subject"], **item.camera, **values, **_gaze(line)}
     marks = []
     for value, part in ((1, "sclera"), (2, "iris"), (3, "pupil")):
         inside = mask == value

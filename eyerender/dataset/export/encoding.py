@@ -1,6 +1,11 @@
-"""Encoding of the sensor's counts in an export: bits, tone curve, and one exposure gain for the whole export.
+"""Encoding of the sensor's counts in an export: as stored, or with a tone curve and one gain for the whole export.
 
-With s = count / (2^source_bit_depth - 1), the share of the source's full scale, and F = 2^bits - 1:
+`stored` gives each pixel the code that its camera stored, with whatever gamma that camera has:
+
+    stored:  code = count                            (more than 8 bits in 8: round(255 count / full scale))
+
+Else, with F = 2^bits - 1 and s = count / (2^source_bit_depth - 1), to the power of the camera's gamma where that is not
+1, which is the linear share of the source's full scale:
 
     linear:  code = round(F min(1, gain s))              s = code / F / gain
     gamma:   code = round(F min(1, gain s)^(1 / 2.2))    s = (code / F)^2.2 / gain
@@ -13,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +33,15 @@ SHARE, LEVEL = 0.995, 0.8
 LARGEST_GAIN = 32.0
 SAMPLED = 256  # images used to measure a gain
 
-Curve = Literal["linear", "gamma"]
+Curve = Literal["stored", "linear", "gamma"]
 
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """Bits (8 or 16), tone curve and gain of the exported images; `gain_from` names the source of the gain."""
+    """Bits (8 or 16), tone curve and gain of the exported images; `gain_from` names the source of the gain.
+
+    Stored codes keep the bits of their source, unless these are too many.
+    """
 
     bits: int
     curve: Curve
@@ -45,25 +53,52 @@ class Encoding:
 
         The counts themselves encode the linear share s of full scale as s^(1 / gamma).
         """
+        if self.keeps(bit_depth, gamma):
+            return image
         table = _table(self.bits, self.curve, self.gain, 2**bit_depth - 1, gamma)
         return np.asarray(table[np.minimum(image.astype(np.intp), len(table) - 1)])
 
     def keeps(self, bit_depth: int, gamma: float = 1.0) -> bool:
         """Return whether the encoding leaves the counts unchanged."""
+        if self.curve == "stored":
+            return bit_depth <= self.bits
         return self.curve == "linear" and self.gain == 1 and self.bits == bit_depth and gamma == 1
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Convert to the mapping in export.json."""
+    def of_image(self, bit_depth: int, gamma: float) -> dict[str, Any]:
+        """Describe the codes of an exported image for its line of metadata; bits and gamma are those of its source."""
+        return {
+            "bit_depth": min(bit_depth, self.bits) if self.curve == "stored" else self.bits,
+            "encoding": self.curve,
+            "gamma": {"stored": gamma, "linear": 1.0, "gamma": GAMMA}[self.curve],
+            "gain": self.gain,
+        }
+
+    def to_mapping(self, gammas: Iterable[float] = (1.0,)) -> dict[str, Any]:
+        """Convert to the mapping in export.json; `gammas` are those of the dataset's images.
+
+        The key `gamma` is null where stored images have several.
+        """
         full = 2**self.bits - 1
-        gamma = self.curve == "gamma"
+        found = {self.of_image(self.bits, own)["gamma"] for own in gammas}
+        formula, inverse = {
+            "stored": (
+                "code = round(count * (2 ** bit_depth - 1) / (2 ** source_bit_depth - 1))",
+                "s = (code / (2 ** bit_depth - 1)) ** gamma",
+            ),
+            "linear": (f"code = round({full} * min(1, gain * s))", f"s = code / {full} / gain"),
+            "gamma": (
+                f"code = round({full} * min(1, gain * s) ** (1 / {GAMMA}))",
+                f"s = (code / {full}) ** {GAMMA} / gain",
+            ),
+        }[self.curve]
         return {
             "bits": self.bits,
             "encoding": self.curve,
-            "gamma": GAMMA if gamma else 1.0,
+            "gamma": found.pop() if len(found) == 1 else None,
             "gain": self.gain,
             "gain_from": self.gain_from,
-            "formula": f"code = round({full} * min(1, gain * s)" + (f" ** (1 / {GAMMA}))" if gamma else ")"),
-            "inverse": (f"s = (code / {full}) ** {GAMMA} / gain" if gamma else f"s = code / {full} / gain"),
+            "formula": formula,
+            "inverse": inverse,
             "s": "count / (2 ** source_bit_depth - 1), to the power of the source's gamma where that is not 1: the "
             "linear share of the source's full scale",
         }
@@ -72,7 +107,7 @@ class Encoding:
         return f"{self.bits} bits, {self.curve}, gain {self.gain:g}"
 
 
-RAW = Encoding(16, "linear", 1.0, "none")
+STORED = Encoding(16, "stored", 1.0, "none")
 
 
 def measured_gain(images: Iterable[tuple[NDArray[Any], int, float]]) -> float:
@@ -100,8 +135,10 @@ def check(bits: int, curve: str | None, gain: float | None) -> None:
     """
     if bits not in (8, 16):
         raise InputError(f"must be 8 or 16, not {bits!r}", source="--bits")
-    if curve not in (None, "linear", "gamma"):
-        raise InputError(f"must be linear or gamma, not {curve!r}", source="--encoding")
+    if curve not in (None, *get_args(Curve)):
+        raise InputError(f"must be one of {', '.join(get_args(Curve))}, not {curve!r}", source="--encoding")
+    if curve == "stored" and gain is not None:
+        raise InputError("codes as stored have none; add '--encoding gamma' or 'linear'", source="--gain")
     if gain is not None and not 1e-3 <= gain <= 1e5:
         raise InputError(f"must be 0.001 to 100000, not {gain!r}", source="--gain")
 
@@ -109,6 +146,8 @@ def check(bits: int, curve: str | None, gain: float | None) -> None:
 @lru_cache(maxsize=4)
 def _table(bits: int, curve: Curve, gain: float, full: int, source_gamma: float) -> NDArray[Any]:
     """Return the code of each possible count."""
+    if curve == "stored":
+        source_gamma = 1.0
     value = np.minimum(1.0, gain * (np.arange(full + 1) / full) ** source_gamma)
     if curve == "gamma":
         value = value ** (1 / GAMMA)

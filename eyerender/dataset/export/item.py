@@ -21,7 +21,7 @@ from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, o
 from ...optics.ellipse import Ellipse, signed_distance
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
 from ..selection import scrambled
-from .encoding import RAW, Encoding
+from .encoding import STORED, Encoding
 
 Prepared = TypeVar("Prepared")
 LinePlace = tuple[Path, int]
@@ -35,7 +35,7 @@ class Item:
     """An image of a dataset, with labels in pixels of the window; `encoding` is that of the export."""
 
     entry: ImageEntry
-    encoding: Encoding = RAW
+    encoding: Encoding = STORED
 
     @cached_property
     def line(self) -> dict[str, Any]:
@@ -107,8 +107,7 @@ class Item:
 
     def exported_line(self) -> dict[str, Any]:
         """Return the metadata of the exported image."""
-        e = self.encoding
-        own = {"bit_depth": e.bits, "encoding": e.curve, "gamma": e.to_mapping()["gamma"], "gain": e.gain}
+        own = self.encoding.of_image(self.bit_depth, self.entry.gamma)
         return {**self.line, **own, "source_bit_depth": self.bit_depth}
 
     @cached_property
@@ -185,6 +184,7 @@ class Items:
         order: (n,) row in metadata.jsonl of each image, in the order of the export.
         images_by_split: number of images of each split, by name.
         bit_depths: bit depths of the images.
+        gammas: gammas of the images.
         sizes: (width, height) of the images.
         lights: largest number of reflections of an image.
         file_name_bytes: length of the longest name of an image, in UTF-8.
@@ -195,10 +195,11 @@ class Items:
         self, folder: ImageFolder, step: Callable[[int], None], *, workers: int = 1, shuffle: int | None = None
     ) -> None:
         self.folder, self.step, self.workers, self.shuffle = folder, step, workers, shuffle
-        self.encoding = RAW
+        self.encoding = STORED
         self.order: Ints = np.arange(len(folder.entries))
         self.images_by_split: dict[str, int] = {}
         self.bit_depths: set[int] = set()
+        self.gammas: set[float] = set()
         self.sizes: set[tuple[int, int]] = set()
         self.lights = self.file_name_bytes = 0
         self.place = folder.path / METADATA, 0
@@ -220,6 +221,7 @@ class Items:
             count_of_samples += own.is_of_sample
             splits[own.split] += 1
             self.bit_depths.add(own.bit_depth)
+            self.gammas.add(own.gamma)
             self.sizes.add(own.size)
             self.lights = max(self.lights, own.lights)
             self.file_name_bytes = max(self.file_name_bytes, own.file_name_bytes)
@@ -324,6 +326,7 @@ class _Surveyed:
     name: str
     split: str
     bit_depth: int
+    gamma: float
     size: tuple[int, int]
     lights: int
     file_name_bytes: int
@@ -336,6 +339,7 @@ def _surveyed(item: Item) -> _Surveyed:
         name=item.name,
         split=item.split,
         bit_depth=item.bit_depth,
+        gamma=item.entry.gamma,
         size=item.entry.window[2:],
         lights=len(item.line["labels"]["lights_mm"]),
         file_name_bytes=len(item.entry.name.encode()),

@@ -51,5 +51,5 @@ def write(items: Items, out: Path) -> None:
 
 def _row(item: Item, lights: int) -> tuple[str, dict[str, Any]]:
     """Return the name of an image's shard, and its labels."""
-    row = {"__key__": item.name, **labels_of(item, lights), "bit_depth": item.bit_depth}
+    row = {"__key__": item.name, **labels_of(item, lights)}
     return PurePosixPath(item.entry.name).parent.name, {key: row[key] for key in row if key not in _ENCODING}

@@ -11,7 +11,10 @@ from ...base.storage.files import write_bytes
 from .gaze import gaze_of, pupil_of
 from .item import Item, Items
 
-_COLUMNS = ("sample", "subject", "split", "sequence_index", "bit_depth", "encoding", "gain", "source_bit_depth")
+_COLUMNS = (
+    *("sample", "subject", "split", "sequence_index"),
+    *("bit_depth", "encoding", "gamma", "gain", "source_bit_depth"),
+)
 _ELLIPSE = ("x_px", "y_px", "a_px", "b_px", "angle_rad")
 
 
