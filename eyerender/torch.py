@@ -21,7 +21,7 @@ Both datasets yield each image as a mapping with the requested parts:
 Pictures of any bit depth become shares of the full scale, so folders of different sensors can be joined; with `size`,
 those of different cameras, too. With `encoding="stored"`, the default, they are the codes that the camera stored, as in
 a recorded picture; `linear` undoes the camera's gamma. Every mapping also has `sample` and `subject`, the numbers of
-the sample and of its subject. Folders that `render` wrote have only pictures and lines.
+the sample and of its subject. Folders that `render` wrote have the same labels, but no such numbers.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def features(
     from ..imaging.labels import space_labels
 
     if points < 6:
-        raise InputError("must be >= 6", source="--points")
+        raise InputError(f"must be >= 6, not {points}", source="--points")
     if points > MAX_BOUNDARY_POINTS:
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
     heed = Heed(strict)

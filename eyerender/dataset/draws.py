@@ -50,7 +50,7 @@ class _RangeDraw(_Draw):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not self.low < self.high:
-            raise ValueError("low must be < high")
+            raise ValueError(f"low must be < high, not {self.low:g} and {self.high:g}")
         return self
 
 

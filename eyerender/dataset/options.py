@@ -69,49 +69,71 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanOptions:
-    """Subjects, splits and image size that replace those of the spec.
+    """Subjects, splits, image size and storage that replace those of the spec.
 
     Attributes:
-        subjects: Replace the number of subjects of the plan.
+        subjects: Replace the number of subjects of the dataset.
         splits: Replace the splits, as NAME=SHARE,NAME=SHARE: the shares of the subjects.
         size: Replace the size of the pictures, as WIDTHxHEIGHT in pixels; the cameras are scaled so that they see the
             same.
         layout: Replace the layout of the folder: each picture a file (files), or each shard one tar that mixes subjects
             (webdataset).
+        shard_size: Replace the number of samples in a shard.
+        spp: Replace the number of samples per pixel.
     """
 
     subjects: int | None = None
     splits: str | None = None
     size: str | None = None
     layout: Literal["files", "webdataset"] | None = None
+    shard_size: int | None = None
+    spp: int | None = None
 
-    def apply(self, spec: DatasetSpec) -> DatasetSpec:
-        """Return the spec with these changes.
+    def apply(self, spec: DatasetSpec, count: int | None = None) -> DatasetSpec:
+        """Return the spec with these changes; `count` is the number of samples to make, by default that of the spec.
+
+        Where subjects are replaced, the plan is not continued by new ones: a larger `count` is a larger plan.
 
         Raises:
             InputError: a value cannot be parsed, or does not fit.
         """
+        from .draws import is_draw
         from .picturesize import scaled
 
+        samples = count or spec.count
         if self.subjects is not None:
-            spec = spec.replaced("--subjects", {"subjects": self.subjects})
+            if self.subjects > samples:
+                reason = f"must be at most {samples}, the number of samples, not {self.subjects}"
+                raise InputError(reason, source="--subjects")
+            planned = max(samples, spec.planned_count)
+            own = {"subjects": self.subjects, "planned": None if planned == spec.count else planned}
+            spec = spec.replaced("--subjects", own)
         if self.splits is not None:
             spec = spec.replaced("--splits", {"splits": _splits(self.splits)})
         if self.size is not None:
             spec = spec.replaced("--size", {"scene": scaled(spec.scene, _size(self.size))})
         if self.layout is not None:
-            spec = spec.replaced("--layout", _of_layout(spec, self.layout))
+            spec = spec.replaced("--layout", _of_layout(spec, self.layout, samples))
+        if self.shard_size is not None:
+            spec = spec.replaced("--shard-size", {"shard_size": self.shard_size})
+        if self.spp is not None:
+            if self.spp < 1:
+                raise InputError(f"must be >= 1, not {self.spp}", source="--spp")
+            image = spec.scene.get("image") or {}
+            if is_draw(image):
+                raise InputError("the spec draws the whole image", source="--spp")
+            spec = spec.replaced("--spp", {"scene": {**spec.scene, "image": {**image, "spp": self.spp}}})
         return spec
 
 
-def _of_layout(spec: DatasetSpec, layout: str) -> dict[str, Any]:
+def _of_layout(spec: DatasetSpec, layout: str, samples: int) -> dict[str, Any]:
     """Convert the values of a spec to another layout; too small packed shards get their default size."""
     if layout == "files":
         return {"layout": None}
-    from .spec import PACKED_SHARD
+    from .spec import LEAST_SHARDS, PACKED_SHARD
 
-    size = min(PACKED_SHARD, -(-spec.planned_count // 16))
-    return {"layout": layout, "shard_size": max(spec.shard_size, size)}
+    planned = spec.planned_count if samples < LEAST_SHARDS * PACKED_SHARD else samples
+    return {"layout": layout, "shard_size": max(spec.shard_size, min(PACKED_SHARD, -(-planned // LEAST_SHARDS)))}
 
 
 def _splits(text: str) -> dict[str, Any]:

@@ -128,7 +128,7 @@ class Plan:
         `scenes`, or `module:function` instead of a file, is a function that gives the scenes (`OwnScenes`). It replaces
         what the spec says of them; without a spec, `count` is needed. `eye` and `seed` replace those of the spec;
         parameters of other eye models are then dropped. `count` requests so many samples of the plan, or of its
-        continuation (see `DatasetSpec.first`). `changes` replaces subjects, splits and the size of the pictures.
+        continuation (see `DatasetSpec.first`). `changes` replaces subjects, splits, the size of the pictures and more.
 
         Raises:
             InputError: the spec cannot be read, or a value does not fit.
@@ -143,7 +143,7 @@ class Plan:
         file, spec = _spec_of(given, own, count, changes)
         if seed is not None:
             spec = spec.replaced("--seed", {"seed": seed})
-        spec = changes.apply(spec)
+        spec = changes.apply(spec, count)
         if count is not None:
             spec = spec.first(count)
         if own is not None:

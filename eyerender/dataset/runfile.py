@@ -56,7 +56,10 @@ def check_work(spec: DatasetSpec, folder: Path) -> None:
     Raises:
         InputError: there are too many, or too many samples to choose from.
     """
-    shards, choices = -(-spec.planned_count // spec.shard_size), spec.count if spec.selection.spread else 0
+    shards, choices = (
+        -(-max(spec.planned_count, spec.count) // spec.shard_size),
+        spec.count if spec.selection.spread else 0,
+    )
     if shards > MAX_SHARDS or choices > MAX_CHOICES:
         reason = f"is too large: at most {MAX_SHARDS} shards, or {MAX_CHOICES} samples of subjects in turn, are listed"
         raise InputError(reason, source=str(folder / RUN), path="spec.count")

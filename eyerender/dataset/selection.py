@@ -126,7 +126,7 @@ class Joined(Sequence[int]):
 class Selection:
     """The `count` samples to make of a plan with `planned` samples and `subjects` subjects, in shards of a given size.
 
-    With a seed to `interleave`, every shard mixes subjects (`Interleaving`); each block of the plan has its own shards.
+    With a seed to `interleave`, every shard mixes subjects (`Interleaving`); blocks of the plan follow each other.
     """
 
     count: int
@@ -135,11 +135,6 @@ class Selection:
     shard_size: int
     spread: bool
     interleave: int | None = None
-
-    @property
-    def _block_shards(self) -> int:
-        """Number of shards per interleaved block."""
-        return -(-self.planned // self.shard_size)
 
     @cached_property
     def _mixed(self) -> Interleaving:
@@ -153,7 +148,7 @@ class Selection:
             return sample // self.shard_size
         block, k = divmod(sample, self.planned)
         at = int(self._mixed.positions_of(np.array([k]))[0])
-        return block * self._block_shards + at // self.shard_size
+        return (block * self.planned + at) // self.shard_size
 
     def subject_of(self, sample: int) -> int:
         """Return the subject of a sample."""
@@ -183,7 +178,7 @@ class Selection:
     @property
     def end(self) -> int:
         """Upper bound of the sample numbers, exclusive."""
-        return -(-self.count // self.planned) * self.planned if self.spread else self.count
+        return self._blocks_end if self.spread else self.count
 
     def are_made(self, samples: Ints) -> Bools:
         """Return whether samples are selected, (n,)."""
@@ -218,10 +213,7 @@ class Selection:
     def shard_samples(self, shard: int) -> Sequence[int]:
         """Return the samples of a shard, in order; as a range if they are consecutive."""
         if self.interleave is not None:
-            block, k = divmod(shard, self._block_shards)
-            end = min((k + 1) * self.shard_size, self.planned)
-            mixed = np.sort(self._mixed.samples_at(np.arange(k * self.shard_size, end, dtype=np.int64)))
-            mixed += block * self.planned
+            mixed = np.sort(self._mixed_at(shard * self.shard_size, (shard + 1) * self.shard_size))
             return list(map(int, mixed[self.are_made(mixed)]))
         samples = range(shard * self.shard_size, min((shard + 1) * self.shard_size, self.end))
         if not self.spread:
@@ -234,9 +226,9 @@ class Selection:
     def shard_count(self, shard: int) -> int:
         """Return the number of samples of a shard; fast where its block is made as a whole."""
         if self.interleave is not None:
-            block, k = divmod(shard, self._block_shards)
-            if (block + 1) * self.planned <= self.count:
-                return min((k + 1) * self.shard_size, self.planned) - k * self.shard_size
+            first, end = shard * self.shard_size, min((shard + 1) * self.shard_size, self._blocks_end)
+            if end <= self._whole:
+                return end - first
         return len(self.shard_samples(shard))
 
     @cached_property
@@ -247,17 +239,23 @@ class Selection:
         return Joined(range(self._whole), np.concatenate(list(self._chunks(self._whole))))
 
     def _interleaved_shards(self) -> Sequence[int]:
-        """Return the shards of complete blocks, and those of the last block that hold a sample."""
-        blocks, left = divmod(self.count, self.planned)
-        head = range(blocks * self._block_shards)
-        if not left:
-            return head
+        """Return the shards of complete blocks, and those after them that hold a sample."""
+        head = range(self._whole // self.shard_size)
         found = [np.zeros(0, dtype=np.int64)]
-        for start in range(0, self.planned, _CHUNK):
-            positions = np.arange(start, min(start + _CHUNK, self.planned), dtype=np.int64)
-            made = self.are_made(self._mixed.samples_at(positions) + blocks * self.planned)
-            found.append(np.unique(positions[made] // self.shard_size))
-        return Joined(head, np.unique(np.concatenate(found)) + len(head))
+        for start in range(len(head) * self.shard_size, self._blocks_end, _CHUNK):
+            made = self.are_made(self._mixed_at(start, start + _CHUNK))
+            found.append(np.unique((np.flatnonzero(made) + start) // self.shard_size))
+        return Joined(head, np.unique(np.concatenate(found)))
+
+    def _mixed_at(self, start: int, stop: int) -> Ints:
+        """Return the samples at the positions from `start` to `stop` of the interleaved order of all blocks."""
+        block, k = np.divmod(np.arange(start, min(stop, self._blocks_end), dtype=np.int64), self.planned)
+        return self._mixed.samples_at(k) + block * self.planned
+
+    @property
+    def _blocks_end(self) -> int:
+        """Number of samples in all begun blocks."""
+        return -(-self.count // self.planned) * self.planned
 
     @property
     def _whole(self) -> int:

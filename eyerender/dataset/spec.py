@@ -23,7 +23,7 @@ from .selection import Selection
 
 # Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
-_LEAST_SHARDS = 16
+LEAST_SHARDS = 16
 PACKED_SHARD = 1000  # samples of a packed shard by default, so that millions of images make some thousand files
 SPLITS_SLACK = 0.01  # most by which the sum of shares may differ from 1, so that thirds can be written
 SPLIT_NAME = re.compile(r"[a-z][a-z0-9]*")
@@ -145,13 +145,13 @@ class DatasetSpec(FileSpec):
         """Divide a small plan into enough shards for several workers."""
         if "shard_size" not in self.model_fields_set:
             size = PACKED_SHARD if self.is_packed else self.shard_size
-            object.__setattr__(self, "shard_size", min(size, -(-self.planned_count // _LEAST_SHARDS)))
+            object.__setattr__(self, "shard_size", min(size, -(-self.planned_count // LEAST_SHARDS)))
         return self
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.subjects is not None and self.subjects > self.planned_count:
-            raise ValueError("subjects: must be <= count, or planned where it is given")
+            raise ValueError(f"subjects: must be at most {self.planned_count} (count or planned), not {self.subjects}")
         if self.population is not None and self.eye_parameters:
             raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
         for name in self.variables or {}:

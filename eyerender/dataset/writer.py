@@ -80,7 +80,7 @@ class DatasetWriter:
         for key in settings.keys() - set(_SETTINGS):
             raise InputError(f"must be one of {', '.join(_SETTINGS)}", path=key)
         if frames < 1:
-            raise InputError("must be >= 1", path="frames")
+            raise InputError(f"must be >= 1, not {frames}", path="frames")
         fixed = {"kind": "dataset", "count": count, "attempts": 1, "scene": {}}
         # The number of samples is no part of the plan, so the folder can grow.
         own = {"name": "own", "require": "nothing", "shard_size": 64, **settings, "planned": MAX_COUNT}

@@ -51,7 +51,7 @@ class Normal(Spec):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise ValueError("low must be < high")
+            raise ValueError(f"low must be < high, not {self.low:g} and {self.high:g}")
         return self
 
     @property
@@ -121,7 +121,7 @@ class Uniform(Spec):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not self.low < self.high:
-            raise ValueError("low must be < high")
+            raise ValueError(f"low must be < high, not {self.low:g} and {self.high:g}")
         return self
 
     def at(self, z: Floats) -> Floats:

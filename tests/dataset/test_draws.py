@@ -179,7 +179,7 @@ def test_the_order_of_keys_means_nothing():
     ("path", "node", "words"),
     [
         ("scene.wavelength_nm", {"draw": "gamma"}, "scene.wavelength_nm.draw: must be one of fixed, uniform"),
-        ("scene.wavelength_nm", {"draw": "uniform", "low": 2, "high": 1}, "low must be < high"),
+        ("scene.wavelength_nm", {"draw": "uniform", "low": 2, "high": 1}, "low must be < high, not 2 and 1"),
         ("scene.wavelength_nm", {"draw": "log_uniform", "low": 0, "high": 1}, "scene.wavelength_nm.low: must be > 0"),
         ("scene.wavelength_nm", {"draw": "uniform", "low": 2}, "scene.wavelength_nm.high: missing"),
         ("scene.wavelength_nm", {"draw": "uniform", "low": 2, "high": 3, "x": 1}, "scene.wavelength_nm.x: unknown key"),
@@ -195,7 +195,7 @@ def test_the_order_of_keys_means_nothing():
         ("scene.eye.model", {"draw": "choice", "per": "sample", "values": ["E2"]}, "drawn once per subject"),
         ("eye_parameters.E5", {}, "eye_parameters.E5: no sample uses this eye"),
         ("eye_parameters.E2", {"cornea.3.radius": 1}, "eye_parameters.E2.cornea.3.radius: no such number"),
-        ("subjects", 25, "subjects: must be <= count"),
+        ("subjects", 25, "subjects: must be at most 24 (count or planned), not 25"),
         ("splits", {"Train set": 1.0}, "a name must consist of lower-case letters and digits"),
         ("splits", {}, "splits: give at least one"),
         ("count", 0, "count: must be >= 1"),

@@ -44,3 +44,10 @@ def test_hashes_are_those_of_splitmix64():
     """Published values of the reference implementation for the seed 1234567 (Vigna)."""
     published = [6457827717110365317, 3203168211198807973, 9817491932198370423]
     assert scrambled(np.arange(1, 4), 1234567).tolist() == published
+
+
+def test_shards_have_their_size_across_the_blocks_of_a_plan():
+    selection = Selection(count=12_160, planned=3_040, subjects=152, shard_size=1000, spread=False, interleave=1)
+    sizes = [len(selection.shard_samples(shard)) for shard in selection.shards]
+    assert sizes == [1000] * 12 + [160]
+    assert sizes == [selection.shard_count(shard) for shard in selection.shards]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import resource
+import subprocess
+import sys
 from collections import Counter
 
 import numpy as np
@@ -22,6 +26,54 @@ def test_subjects_and_splits_are_replaced(tmp_path):
     plan = loaded(write(tmp_path / "tiny.yaml"), subjects=8, splits="train=.75,test=.25")
     assert Counter(plan.split_of(s) for s in range(8)) == {"train": 6, "test": 2}
     assert [plan.subject_of(i)[0] for i in (0, 2, 3, 23)] == [0, 0, 1, 7]
+
+
+@pytest.mark.parametrize("count", [8, 24, 100])
+def test_subjects_are_those_of_the_whole_dataset(tmp_path, count):
+    """Also beyond the plan of 24 samples, which then grows instead of being continued by new subjects."""
+    selection = loaded_of(tmp_path, count, subjects=8).spec.selection
+    images = Counter(selection.subject_of(i) for i in selection.samples)
+    assert sorted(images) == list(range(8))
+    assert max(images.values()) - min(images.values()) <= 1
+    assert sum(images.values()) == count
+
+
+def loaded_of(tmp_path, count, **options):
+    return Plan.load(write(tmp_path / "tiny.yaml"), count=count, changes=PlanOptions(**options))
+
+
+def test_a_dataset_of_given_subjects_grows_within_its_plan(tmp_path):
+    digests = {loaded_of(tmp_path, count, subjects=8).digest for count in (8, 16, 24)}
+    assert len(digests) == 1
+    assert loaded_of(tmp_path, 25, subjects=8).digest not in digests
+
+
+def test_samples_per_pixel_are_replaced(tmp_path):
+    assert loaded(write(tmp_path / "tiny.yaml"), spp=5).draw(3).build().spec.image.spp == 5
+    drawn = write(tmp_path / "drawn.yaml", **{"scene.image": {"draw": "choice", "values": [{"spp": 2}, {"spp": 3}]}})
+    with pytest.raises(InputError, match="--spp: the spec draws the whole image"):
+        loaded(drawn, spp=5)
+
+
+@pytest.mark.parametrize(
+    ("argv", "shards", "most_cpu_s"),
+    [
+        ([], 16, None),  # 240 images of a plan of 3,040
+        (["--count", "5000000", "--subjects", "1000", "--layout", "webdataset"], 5000, 5.0),
+        (["--count", "5000800", "--layout", "webdataset", "--shard-size", "500"], 10002, None),  # 1645 plans
+    ],
+)
+def test_a_dry_run_states_shards_of_a_stated_size(argv, shards, most_cpu_s):
+    """In a process of its own, start of Python included."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    out = subprocess.run(
+        [sys.executable, "-m", "eyerender", "generate", "people_openeds", *argv, "--dry-run", "--json", "-"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert json.loads(out.stdout)["shards"] == shards
+    if most_cpu_s is not None:
+        assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime <= most_cpu_s
 
 
 @pytest.mark.parametrize(
@@ -79,7 +131,9 @@ def test_lengths_in_pixels_scale_with_the_size(tmp_path):
         ({"splits": "train:1"}, "--splits: must be NAME=SHARE,NAME=SHARE"),
         ({"splits": "train=8,test=2"}, "--splits: splits: shares must add up to 1, not 10"),
         ({"splits": "Train=1"}, "--splits: splits.Train: a name must consist of"),
-        ({"subjects": 25}, "--subjects: subjects: must be <= count, or planned where it is given"),
+        ({"subjects": 25}, "--subjects: must be at most 24, the number of samples, not 25"),
+        ({"shard_size": 0}, "--shard-size: must be >= 1, not 0"),
+        ({"spp": 0}, "--spp: must be >= 1, not 0"),
     ],
 )
 def test_wrong_options_are_refused(tmp_path, options, words):

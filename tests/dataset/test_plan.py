@@ -118,7 +118,7 @@ def test_neighbours_of_a_spread_order_are_far_apart():
 def test_a_plan_has_at_least_the_samples_and_the_subjects_that_are_asked_for():
     for changes, words in (
         ({"planned": 0}, "planned: must be >= 1"),
-        ({"planned": 30, "subjects": 31}, "subjects: must be <= count, or planned where it is given"),
+        ({"planned": 30, "subjects": 31}, r"subjects: must be at most 30 \(count or planned\), not 31"),
     ):
         with pytest.raises(InputError, match=words):
             plan(**changes)

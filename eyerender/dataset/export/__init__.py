@@ -91,7 +91,7 @@ def export(
     """
     _check_options(format, bits, encoding, gain, shuffle)
     if workers < 1:
-        raise InputError("must be >= 1", source="--workers")
+        raise InputError(f"must be >= 1, not {workers}", source="--workers")
     folder = ImageFolder.load(path)
     if format == "labels":
         labels.check_packed(folder)
