@@ -124,10 +124,10 @@ def test_gaze_does_not_depend_on_the_eye_and_few_samples_cover_it(name, count):
     drawn = [made.draw(sample) for sample in made.spec.selection.samples]
     right = np.array([sample.scene["subject"]["eyes"][0] == "right" for sample in drawn])
     assert right.mean() == pytest.approx(0.5) or name == "people_eyelink"  # which shows both eyes in each picture
-    places = ("targets.world_mm.0.1", "targets.world_mm.0.2", "targets.screen_mm.0.0", "targets.screen_mm.0.1")
-    gaze = np.array([[sample.draws[key] for key in places if key in sample.draws] for sample in drawn])
-    if gaze.size == 0:
-        pytest.skip("its gaze is not drawn by one sequence")
+    away, towards = (np.radians([one.draws[f"variables.{key}"] for one in drawn]) for key in ("away", "towards"))
+    gaze = np.column_stack([away * np.cos(towards), away * np.sin(towards)])
+    if count == 240:  # even in angle, to 35 degrees
+        assert np.histogram(np.degrees(away), np.linspace(0, 35, 8))[0] == pytest.approx(240 / 7, abs=4)
     assert {tuple(row) for row in gaze > np.median(gaze, axis=0)} == {
         (a, b) for a in (True, False) for b in (True, False)
     }

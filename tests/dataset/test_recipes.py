@@ -90,3 +90,14 @@ def test_irises_of_the_iris_camera_are_as_wide_as_stated():
         distance = np.linalg.norm(np.subtract(camera.position_mm, camera.look_at_mm))
         assert 0.28 < camera.focal_length_px * 11.7 / distance / camera.resolution_px[0] < 0.72
     assert {scene.rig.light_count for scene in found} == {1, 2, 4, 6, 8}
+
+
+@pytest.mark.parametrize("name", [*RATES_HZ, "dataset_binocular"])
+def test_a_tenth_of_the_pictures_is_shut_and_a_tenth_half_shut(name):
+    """Within 3 standard errors of 240 samples, as `inspect` bounds them."""
+    plan = Plan.load(name)
+    made = Plan.of(plan.spec.model_copy(update={"population": None}))  # people cost time and draw nothing of it
+    blinks = np.array([made.draw(k).scene["region"]["blink"] for k in made.spread(240)])
+    slack = 3 * np.sqrt(0.1 * 0.9 / 240)
+    assert np.mean(blinks >= 0.75) == pytest.approx(0.1, abs=slack)
+    assert np.mean((blinks >= 0.25) & (blinks < 0.75)) == pytest.approx(0.1, abs=slack)
