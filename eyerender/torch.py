@@ -14,7 +14,7 @@ Both datasets yield each image as a mapping with the requested parts:
 | `glints` | float32 (lights, 3): x, y in px of the image, and 1 visible or 0 hidden; nan where there is none |
 | `lids` | float32 (2, 17, 2): landmarks of upper and lower lid in px, from the temple to the nose; nan for a bare eye |
 | `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad; or nan |
-| `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye |
+| `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye; nan without an eye |
 | `camera` | a mapping: `index`, `K` (3, 3) for px of the image, `R` (3, 3), `t_mm` (3,), `distortion` (5,) |
 | `line` | the whole line of metadata, a dict |
 
@@ -396,7 +396,8 @@ def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any
         x, y = ellipse["centre_px"]
         return torch.tensor([x - window["x0"], y - window["y0"], *ellipse["semi_axes_px"], ellipse["angle_rad"]])
     if part == "gaze":
-        return torch.tensor(line["labels"]["space"]["camera"]["line_of_sight"])
+        there = line["labels"].get("eye_present", True)
+        return torch.tensor(line["labels"]["space"]["camera"]["line_of_sight"] if there else [math.nan] * 3)
     others = {"glints": _glints, "lids": _lids, "camera": _camera}
     return others[part](line) if part in others else line
 

@@ -251,7 +251,7 @@ BOUNDS = {
     "eye": 3220,
     "folders": 1840,  # videos: what is missing of damaged ones; files of other programs named, for their owners
     "gaze": 5230,  # calibrations that survive blinks; tables of other trackers; rings that lose glints, for headsets
-    "imaging": 2290,  # one line of metadata for all folders; eyes of cameras; the camera and window of files
+    "imaging": 2305,  # pictures without an eye, for those who train; the camera and window of files
     "optics": 5180,
     "population": 2520,
     "region": 4110,  # heads from STL and GLB files of any tool, with all mistakes named at once

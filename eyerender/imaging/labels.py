@@ -33,6 +33,7 @@ from .renderable import RenderableFrames, RenderableScene
 RIM_HIDDEN = "the cornea hides a part of its rim"
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
+_REACH_MM = 20.0  # from the globe's centre: the lids from corner to corner are about 30 mm wide
 _FAR_MM = 1e9  # a distant observer: the entrance pupil looks larger than from infinity by 3e-9 of its size
 
 
@@ -73,7 +74,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
     points = truth.pupil.points_px[image.row]
     whole = bool(truth.pupil.ok[image.row]) and len(points) > 2
     return {
-        "eye_present": True,
+        "eye_present": known["eye_present"],
         "pupil": {
             **known["pupil"],
             "visible": moments_ellipse(part == PUPIL, window),
@@ -100,6 +101,7 @@ def known_labels(scene: RenderableScene, observations: Observations, view: EyeIn
     """Compute the labels that follow from pose and parameters, without an image: a part of `image_labels`."""
     camera = scene.rig.cameras[view.camera]
     return {
+        "eye_present": eye_present(camera, view),
         "pupil": {
             "amodal": _ellipse_of_record(observations, view.row),
             "entrance_diameter_mm": entrance_diameter_mm(view.eye),
@@ -120,6 +122,20 @@ def known_labels(scene: RenderableScene, observations: Observations, view: EyeIn
         },
         "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
     }
+
+
+def eye_present(camera: PinholeCamera, view: EyeInWindow | EyeImage) -> bool:
+    """Return whether an eye, open or shut, is within reach of the window: a sphere of `_REACH_MM` about the globe.
+
+    Where a recipe moves the head out of the camera's view, as of a headset that was taken off, it is not.
+    """
+    centre = rotated(view.M, view.eye.sclera.centre_mm) + view.t
+    depth = float((rotated(camera.R, centre) + camera.t)[2])
+    if depth <= _REACH_MM:
+        return depth > -_REACH_MM
+    x, y = camera.project(centre[None])[0][0] - view.window[:2]
+    aside = np.maximum([-x, -y], [x - view.window[2] + 1, y - view.window[3] + 1])
+    return bool(np.hypot(*np.maximum(aside, 0.0)) <= max(camera.K[0, 0], camera.K[1, 1]) * _REACH_MM / depth)
 
 
 def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:

@@ -39,13 +39,11 @@ class Blur:
         Raises:
             InputError: the eye would be blurred over more than 400 px.
         """
-        if job.lens.focus_mm is None:
-            return cls(job, 0.0, False, 0)
         camera, sensor = job.camera, job.sensor
-        eye = job.eye.stop.centre_mm @ job.M.T + job.t
-        subject = defocus.checked(
-            float(defocus.confusion_px(job.lens, camera, sensor, camera.R[2] @ eye + camera.t[2]))
-        )  # fmt: skip
+        depth = float(camera.R[2] @ (job.eye.stop.centre_mm @ job.M.T + job.t) + camera.t[2])
+        if job.lens.focus_mm is None or depth <= 0:  # a head behind the camera
+            return cls(job, 0.0, False, 0)
+        subject = defocus.checked(float(defocus.confusion_px(job.lens, camera, sensor, depth)))
         depths = _depths(job, posed)
         sizes = defocus.confusion_px(job.lens, camera, sensor, depths)
         if np.min(depths) < job.lens.focus_mm < np.max(depths):
