@@ -67,7 +67,8 @@ def measure(entry: ImageEntry) -> PictureSummary:
         faults.append(Fault("size", f"is {_size(image)} px, but its window is {width} x {height}"))
     codes = eight_bits(image, int(entry.line.get("bit_depth") or stored))
     thumbnail = np.asarray(Image.fromarray(codes).resize((SIDE, SIDE), Image.Resampling.BOX))
-    if entry.labels.get("eye_present", True):
+    labels = entry.line.get("labels")
+    if not (isinstance(labels, dict) and labels.get("eye_present") is False):
         faults += _blank(thumbnail)
     mask = _mask(entry, image.shape, faults)
     numbers = _levels(codes)
