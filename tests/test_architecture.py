@@ -245,11 +245,11 @@ BOUNDS = {
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
     "cli": 2635,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
-    "dataset": 10130,  # the codes that cameras stored in every export, shards of a stated size, for trainers
+    "dataset": 10135,  # the codes that cameras stored in every export, shards of a stated size, for trainers
     "design": 3290,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
     "eye": 3220,
-    "folders": 1840,  # videos: what is missing of damaged ones; files of other programs named, for their owners
+    "folders": 1845,  # compressed depth and normals, for those who train; what is missing of damaged videos
     "gaze": 5230,  # calibrations that survive blinks; tables of other trackers; rings that lose glints, for headsets
     "imaging": 2305,  # pictures without an eye, for those who train; the camera and window of files
     "optics": 5180,

@@ -32,9 +32,9 @@ _MORE = {
     "amodal_masks": "\n- `amodal_mask_file_name`: the same without anything in front of the eye.",
     "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without sensor noise.",
     "highlights": "\n- `highlight_mask_file_name`: 1 where wet and oily surfaces mirror a lamp; these are no glints.",
-    "depth": "\n- `depth_file_name` (.npy, float32): mm along the camera's axis to the first surface; NaN: none.",
-    "normals": "\n- `normals_file_name` (.npy): its unit normals in the camera's frame (x right, y down, z forward).",
-    "iris_coordinates": "\n- `iris_coordinates_file_name` (.npy): the place in the plane of the iris that the pixel "
+    "depth": "\n- `depth_file_name` (.npz, array `data`): mm along the camera's axis to the first surface; NaN: none.",
+    "normals": "\n- `normals_file_name` (.npz): its unit normals in the camera's frame (x right, y down, z forward).",
+    "iris_coordinates": "\n- `iris_coordinates_file_name` (.npz): the place in the plane of the iris that the pixel "
     "shows, mm toward the nose and up from the centre of the pupil.",
     "instances": "\n- `instance_mask_file_name`: 0 background, 1 to 4 as the mask, 5 skin, 6 upper lid, 7 lower lid, "
     "8 lashes, 9 brow, 10 caruncle, 11 tears of a head mesh.",

@@ -65,8 +65,8 @@ def layout_of(schema: object) -> FolderLayout | None:
 
 
 def picture_file(kind: str, name: str) -> str:
-    """Name of the file of a picture of an image: arrays of real numbers are .npy, others .png."""
-    return f"{name}{'.npy' if KINDS[kind] in ARRAY_KEYS else '.png'}"
+    """Name of the file of a picture of an image: arrays of real numbers are .npz, others .png."""
+    return f"{name}{'.npz' if KINDS[kind] in ARRAY_KEYS else '.png'}"
 
 
 def _is_count(value: object) -> bool:

@@ -146,6 +146,8 @@ class Maker:
             name, line = sample_line(found, image.row, self.frames, image.window, labels)
             kinds = self.plan.spec.labels.pictures
             pictures = {kind: _PICTURES[kind](image) for kind in kinds}
+            if self.plan.spec.labels.half_precision:
+                pictures |= {k: v.astype(np.float16) for k, v in pictures.items() if v.dtype.kind == "f"}
             yield MadeImage(name, pictures, line, is_saturated(image.counts, image.scene.spec.sensor))
 
 

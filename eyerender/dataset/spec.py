@@ -54,7 +54,11 @@ class LabelsSpec(Spec):
         description="also write what each pixel's centre shows: `depth` (mm along the camera's axis), `normals` (in "
         "the camera's frame), `iris_coordinates` (mm toward the nose and up in the plane of the iris, from the centre "
         "of the pupil, as seen through the cornea) and `instances` (masks in which lids, lashes, brow, skin and "
-        "background differ); all but the last are .npy files; default: none",
+        "background differ); all but the last are .npz files; default: none",
+    )
+
+    half_precision: bool = Field(
+        default=False, description="store arrays of geometry as float16, which takes half the space or less"
     )
 
     @property

@@ -50,7 +50,7 @@ _FOLDERS = re.compile(rf"(images/)?(({_KINDS}|shards)(/[0-9]+)?)|images|layouts"
 _FILES = re.compile(
     r"(images/)?("  # a study's images are a dataset in their own folder
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
-    rf"({_KINDS})/([0-9]+/)?[^/]+\.(png|exr|npy)|"
+    rf"({_KINDS})/([0-9]+/)?[^/]+\.(png|exr|npz)|"
     r"shards/[0-9]+/(lines\.jsonl|lines\.jsonl\.gz|images\.tar|done\.json)|index\.npy)"
     r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
 )

@@ -8,6 +8,7 @@ import yaml
 
 from eyerender.cli.main import run
 from eyerender.dataset.spec import shipped_datasets
+from eyerender.folders.imagefile import picture_bytes
 from eyerender.folders.imagefolder import ImageFolder
 from eyerender.scene import load_scene
 from tests.support.in_process import single_workers_in_process
@@ -38,7 +39,7 @@ def test_normals_are_judged_against_their_own_rays(tmp_path, capsys, name):
     entry = ImageFolder.load(folder).entries[0]
     normals = entry.normals()
     turned = np.where(np.isnan(normals[..., 2:]), normals, -normals)
-    np.save(folder / entry.line["normals_file_name"], turned)
+    (folder / entry.line["normals_file_name"]).write_bytes(picture_bytes(turned))
     capsys.readouterr()
     assert run(["validate", str(folder)]) == 1
     assert "its normals are no unit vectors to the camera" in capsys.readouterr().out

@@ -1,7 +1,7 @@
 """WebDataset: tar files of at most 1000 images per split; NAME.png, NAME.mask.png and NAME.json form a sample.
 
 Where the dataset has them, there are NAME.amodal.png, NAME.highlights.png, NAME.noiseless.png, NAME.instances.png,
-NAME.depth.npy, NAME.normals.npy and NAME.iris_coordinates.npy, too.
+NAME.depth.npz, NAME.normals.npz and NAME.iris_coordinates.npz, too.
 """
 
 from __future__ import annotations

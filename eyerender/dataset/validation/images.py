@@ -18,7 +18,7 @@ from .problems import differences
 
 SKIN, SCLERA = 0, 1
 _VISIBLE = 1e-8  # relative; numbers of packed lines are rounded to 5e-9
-_UNIT, _FACING = 1e-5, 1e-3  # of normals
+_UNIT, _FACING = 1e-3, 1e-3  # of normals, which half precision rounds by up to 5e-4
 _EDGES = 1e-3  # share of pixels in which two rays through one place may meet different sides of an edge
 Mask = NDArray[Any]
 
