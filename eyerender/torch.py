@@ -15,13 +15,15 @@ Both datasets yield each image as a mapping with the requested parts:
 | `lids` | float32 (2, 17, 2): landmarks of upper and lower lid in px, from the temple to the nose; nan for a bare eye |
 | `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad; or nan |
 | `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye; nan without an eye |
-| `camera` | a mapping: `index`, `K` (3, 3) for px of the image, `R` (3, 3), `t_mm` (3,), `distortion` (5,) |
+| `camera` | a mapping: `index`, `K` (3, 3) for px of the image, `R` (3, 3), `t_mm` (3,), `distortion`, `mirrored` |
 | `line` | the whole line of metadata, a dict |
 
 Pictures of any bit depth become shares of the full scale, so folders of different sensors can be joined; with `size`,
 those of different cameras, too. With `encoding="stored"`, the default, they are the codes that the camera stored, as in
-a recorded picture; `linear` undoes the camera's gamma. Every mapping also has `sample` and `subject`, the numbers of
-the sample and of its subject. Folders that `render` wrote have the same labels, but no such numbers.
+a recorded picture; `linear` undoes the camera's gamma. `distortion` of a camera is k1, k2, p1, p2, k3, with k4, k5, k6
+for a rational model, or k1, k2, k3, k4, p1, p2 of a fisheye; where `mirrored`, u runs the other way about the principal
+point. Every mapping also has `sample` and `subject`, the numbers of the sample and of its subject. Folders that
+`render` wrote have the same labels, but no such numbers.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ from .dataset.realise import frames_of
 from .dataset.spec import DatasetSpec, GeometryKind
 from .folders.imagefolder import KINDS, ImageFolder
 from .region.mesh import LID_MARKS
+from .rig.camera import PinholeCamera
 
 if TYPE_CHECKING:
     from .dataset.maker import Maker
@@ -441,12 +444,12 @@ def _glints(line: dict[str, Any]) -> torch.Tensor:
 
 def _camera(line: dict[str, Any]) -> dict[str, Any]:
     """The camera of an image, with a camera matrix for px of the image."""
-    own, window = line["labels"]["camera"], line["window_px"]
-    K = torch.tensor(own["K"], dtype=torch.float32)
-    K[0, 2] -= window["x0"]
-    K[1, 2] -= window["y0"]
-    numbers = {key: torch.tensor(own[key], dtype=torch.float32) for key in ("R", "t_mm", "distortion")}
-    return {"index": int(line["parameters"]["camera"]), "K": K, **numbers}
+    own, window = PinholeCamera.from_labels(line["labels"]["camera"]), line["window_px"]
+    numbers = {"K": own.K, "R": own.R, "t_mm": own.t, "distortion": own.distortion}
+    out: dict[str, Any] = {key: torch.tensor(value.tolist(), dtype=torch.float32) for key, value in numbers.items()}
+    out["K"][0, 2] -= window["x0"]
+    out["K"][1, 2] -= window["y0"]
+    return {"index": int(line["parameters"]["camera"]), **out, "mirrored": own.mirrored}
 
 
 def _checked_encoding(encoding: str) -> str:

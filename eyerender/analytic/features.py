@@ -22,6 +22,7 @@ from ..eye.pose import Poses, rigid_motion
 from ..optics.ellipse import fit_ellipse_direct
 from ..optics.surfaces import Xyz
 from ..rig.camera import PinholeCamera
+from ..rig.distortion import is_distorted
 from ..scene.observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from .rays import glint_exits, pupil_exits
 from .view_kernels import project_all, see_all
@@ -234,7 +235,9 @@ class View:
     def project(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
         """Project points of the eye frame to pixels (n, k, 2); NaN where the status is not OK."""
         camera, found = self.camera, np.array(status, dtype=np.int8)
-        plain = not np.any(camera.distortion)
+        if camera.is_fisheye:
+            return self._through_fisheye(points, found)
+        plain = not is_distorted(camera.distortion)
         scale = (
             (camera.across * camera.K[0, 0], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2])
             if plain
@@ -245,3 +248,10 @@ class View:
         ends = np.array(scale), int(Status.BEHIND_CAMERA)
         project_all(self.rotation, self.translation, x, y, z, found, *ends, seen)
         return seen if plain else camera.pixels_of(seen[..., 0], seen[..., 1]), found
+
+    def _through_fisheye(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
+        """Project points of the eye frame as `project` does; `status` is changed."""
+        seen = np.einsum("nij,jnk->nki", self.rotation, np.stack(points)) + self.translation[:, None, :]
+        x, y, front = self.camera.plane(seen)
+        status[(status == Status.OK) & ~front] = Status.BEHIND_CAMERA
+        return np.where((status == Status.OK)[..., None], self.camera.pixels_of(x, y), np.nan), status

@@ -102,7 +102,8 @@ def sensor_noise(
         side = next(filter(camera.sees, scene.spec.subject.eyes), scene.spec.subject.eyes[0])
         eye_mm = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
         lit = {j: lamp for j, lamp in enumerate(lights) if lamp.lights(EYES.index(side))}
-        radiance = iris_radiance(lit.values(), eye_mm, scene.spec.look.iris_albedo)
+        surface, point = camera.light_shares(eye_mm)
+        radiance = surface * iris_radiance(lit.values(), eye_mm, scene.spec.look.iris_albedo)
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
         dark = PUPIL_SHARE * iris
         blur = blur_px(scene, camera, eye_mm)
@@ -111,7 +112,7 @@ def sensor_noise(
         for j, lamp in lit.items():
             energy, size = glint_energy(lamp, camera, eye_mm, sensor, scene.spec.wavelength_nm)
             spread = float(np.hypot(blur, size))
-            glint[k, j] = glint_deviation(energy, spread, dark, read, sensor.full_well_e)
+            glint[k, j] = glint_deviation(point * energy, spread, dark, read, sensor.full_well_e)
     return FeatureNoise(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
 
 

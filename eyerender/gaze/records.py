@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
@@ -152,12 +152,13 @@ class _CameraData(CameraCalibration):
     t_mm: Vec3 = Field(alias="t")
     resolution_px: tuple[_Pixels, _Pixels]
     mirrored: bool | None = None
-    flip: None = None
+    flip: Literal["horizontal"] | None = None
     eyes: EyeNames | None = None
 
     def build(self) -> PinholeCamera:
         camera = PinholeCamera.of(self.K, self.R, self.t_mm, self.resolution_px, self.distortion)
-        return replace(camera, mirrored=bool(self.mirrored), eyes=self.eyes)
+        camera = replace(camera, mirrored=bool(self.mirrored), eyes=self.eyes)
+        return camera if self.flip is None else camera.flipped()
 
 
 class _ScreenData(Spec):

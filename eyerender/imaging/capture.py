@@ -207,12 +207,14 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
     lights = tuple(scene.rig.lights[k] for k in scene.rig.lights_of(int(index.eye[row])))
     if not lights:
         raise InputError(f"none lights the {side} eye; name it in `eyes` of one", path="rig.lights")
+    view, window = scene.rig.cameras[camera], scene.window(camera, head, int(index.eye[row]))
     return RenderJob(
         eye=scene.eye(side),
         M=M,
         t=t,
-        camera=scene.rig.cameras[camera],
-        window=scene.window(camera, head, int(index.eye[row])),
+        camera=view.unflipped,
+        window=view.turned(window) if view.flip else window,
+        flip=view.flip,
         lights=lights,
         sensor=scene.spec.sensor,
         look=scene.spec.look,

@@ -430,15 +430,16 @@ def _lights(
     if not numbers:
         return [-1] * len(found.glints), ["no light of the rig lights this eye"] * len(found.glints)
     places = np.array([rig.lights[k].position_mm for k in numbers]).reshape(-1, 3)
+    flat = camera.flattened(pupil)
     predicted, px_per_mm = predict_glints(
-        camera.ideal(pupil),
-        K=camera.K,
-        R=camera.sensor_axes,
-        t_mm=camera.sensor_offset,
+        camera.ideal(pupil, flat),
+        K=flat.K,
+        R=flat.sensor_axes,
+        t_mm=flat.sensor_offset,
         lights_mm=places,
         eye_mm=eye_mm,
     )
-    assigned = assign_lights(camera.ideal(spots), predicted, shift_sd_px=_PLACE_MM * px_per_mm)
+    assigned = assign_lights(camera.ideal(spots, flat), predicted, shift_sd_px=_PLACE_MM * px_per_mm)
     return [numbers[k] if k >= 0 else -1 for k in assigned.light], assigned.reasons
 
 

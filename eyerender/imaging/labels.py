@@ -112,14 +112,7 @@ def known_labels(scene: RenderableScene, observations: Observations, view: EyeIn
         "space": _space(scene, observations, view, camera),
         "globe_radius_mm": float(view.eye.sclera.radius_mm),
         "pose": {"rotation": view.M.tolist(), "translation_mm": view.t.tolist()},
-        "camera": {
-            "K": camera.K.tolist(),
-            "R": camera.R.tolist(),
-            "t_mm": camera.t.tolist(),
-            "distortion": camera.distortion.tolist(),
-            "resolution_px": list(camera.resolution_px),
-            "mirrored": True if camera.mirrored else None,
-        },
+        "camera": camera.to_mapping("t_mm"),
         "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
     }
 

@@ -84,14 +84,10 @@ def _screen(ax: Any, scene: Scene) -> None:
 def _camera(ax: Any, scene: Scene, number: int) -> None:
     """Draw the pyramid of a camera's field, up to an eighth of its distance to the eyes."""
     camera = scene.rig.cameras[number]
-    w, h = camera.resolution_px
-    edge = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]])
     origin = camera.nodal_point_mm
-    rays = camera.rays(edge)
-    depth = float(np.linalg.norm(origin)) / 8
-    ends = origin + depth * rays / (rays @ camera.axis)[:, None]
-    ax.plot(*np.vstack([ends, ends[:1]]).T, color=ANALYTIC, lw=1.0)
-    for end in ends:
+    ends = camera.corners((0, 0, *camera.resolution_px), float(np.linalg.norm(origin)) / 8)
+    ax.plot(*ends.T, color=ANALYTIC, lw=1.0)
+    for end in ends[:4]:
         ax.plot(*np.stack([origin, end]).T, color=ANALYTIC, lw=1.0)
     ax.scatter(*origin, color=ANALYTIC, s=36, depthshade=False, label="camera" if number == 0 else None)
 

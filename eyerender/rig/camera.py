@@ -1,14 +1,18 @@
-"""Pinhole cameras in OpenCV's convention, with lens distortion.
+"""Cameras in OpenCV's convention, with lens distortion.
 
     x_cam = R x_world + t,   x' = x/z, y' = y/z,   (x'', y'') = distorted (x', y'),   u = fx x'' + cx, v = fy y'' + cy
 
-z forward, x right, y down; pixel centres at integers. At rest (no pan, tilt, roll) a camera looks along -x, towards the
-subject, with +z up in the image.
+Through a fisheye (x', y') = theta (x, y) / |(x, y)|, theta the angle from the optical axis (`distortion.py`). z is
+forward, x right, y down; pixel centres are at integers. At rest (no pan, tilt, roll) a camera looks along -x, towards
+the subject, with +z up in the image.
 
 A camera that looks at a plane mirror (the hot mirror of a headset) takes the picture of its mirror image behind the
 plane, turned left to right. The mirror image of a point is X' = S X + s with S = 1 - 2 n n^T and s = 2 (n . p) n, so
 the camera R, t sees S X + s at R S X + (R s + t). R S has the determinant -1. With F = diag(-1, 1, 1), the virtual
 camera F R S, F (R s + t) is a proper one, and its x' is that of the sensor with the other sign.
+
+A picture that is stored turned left to right, u -> W - 1 - u, is that of a camera with the other sign of x', with the
+principal point at W - 1 - cx and the other sign of p2. So features need no further case.
 """
 
 from __future__ import annotations
@@ -16,29 +20,32 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.errors import InputError
-from ..base.spec import Number, Positive, Side, Spec, Vec2, Vec3
-from ..base.storage.files import shown
+from ..base.spec import NonNegative, Number, Positive, Side, Spec, Vec2, Vec3
 from ..optics.transforms import rotated
+from .distortion import (
+    FARTHEST_RAD,
+    Distortion,
+    coefficients_of,
+    distort,
+    distorted_area,
+    distortion_data,
+    fold_radius,
+    is_distorted,
+    is_fisheye,
+    is_imaged,
+    undistort,
+)
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
-
-
-def _five(value: object) -> object:
-    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 5:
-        raise ValueError(f"must be the five numbers [k1, k2, p1, p2, k3], not {shown(value)}")
-    return tuple(value)
-
-
-Distortion = Annotated[tuple[Number, Number, Number, Number, Number], BeforeValidator(_five)]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
 Window = tuple[int, int, int, int]
 """A part of a sensor: its first column and row, its width and its height (px)."""
@@ -51,6 +58,19 @@ def _distinct(eyes: tuple[Side, ...]) -> tuple[Side, ...]:
 
 
 EyeNames = Annotated[tuple[Side, ...], Field(min_length=1, max_length=2), AfterValidator(_distinct)]
+
+
+def _rising(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    angles = np.array(table)[:, 0]
+    if angles[0] != 0 or np.any(np.diff(angles) <= 0) or angles[-1] > 180:
+        raise ValueError("angles must rise from 0 to at most 180 degrees")
+    return table
+
+
+RelativeIllumination = Annotated[
+    tuple[tuple[Number, NonNegative], ...], Field(min_length=2, max_length=1000), AfterValidator(_rising)
+]
+_DISTORTION = "lens: k1, k2, p1, p2, k3 (OpenCV); or a `fisheye` or `rational` model"
 
 
 def serves(eyes: Sequence[str] | None, side: str) -> bool:
@@ -70,7 +90,7 @@ class CameraCalibration(Spec):
     K: Matrix3 = Field(description="camera matrix, px")
     R: Matrix3 = Field(description="rotation, world to camera")
     t_mm: Vec3 = Field(description="translation, world to camera")
-    distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3")
+    distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description=_DISTORTION)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -86,10 +106,11 @@ class CameraCalibration(Spec):
 
 
 class CalibrationFile(Spec):
-    """Path of a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON) or of ROS (`camera_info`)."""
+    """Path of a calibration file of OpenCV (`cv2.FileStorage`: YAML, XML or JSON), ROS (`camera_info`) or Kalibr."""
 
     file: Annotated[str, Field(min_length=1)] = Field(description="path, relative to the scene")
     unit_mm: Positive = Field(default=1.0, description="length of the file's unit of translation")
+    camera: str | None = Field(default=None, description="key of the camera, in a file of several (Kalibr's cam0)")
 
 
 def _calibration_tag(value: Any) -> str:
@@ -149,7 +170,13 @@ class Camera(Spec):
     focal_length_mm: Positive | None = Field(default=None, description="focal length; `sensor_mm` belongs to it")
     sensor_mm: tuple[Positive, Positive] | None = Field(default=None, description="sensor width and height")
     principal_point_px: Vec2 | None = Field(default=None, description="default: the centre of the sensor")
-    distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description="k1, k2, p1, p2, k3 (OpenCV)")
+    distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description=_DISTORTION)
+    relative_illumination: RelativeIllumination | None = Field(
+        default=None,
+        description="pairs of angle from the optical axis (deg) and illumination of the sensor relative to the axis, "
+        "from the lens' data sheet, with straight lines between them; default: the fall-off of the lens' projection, "
+        "which is cos^4 without distortion",
+    )
     calibration: AnyCalibration | None = Field(
         default=None,
         description="OpenCV's calibration, in place of position, direction and lens; beside a calibration file, "
@@ -163,12 +190,21 @@ class Camera(Spec):
     eyes: EyeNames | None = Field(
         default=None, description="eyes that it sees; it has no frames of the other eye; default: both"
     )
+    flip: Literal["horizontal"] | None = Field(
+        default=None, description="turns the stored picture left to right, after everything else"
+    )
 
     @classmethod
     def from_opencv(
-        cls, path: str | Path, *, size_px: tuple[int, int] | None = None, unit_mm: float = 1.0, **fields: Any
+        cls,
+        path: str | Path,
+        *,
+        size_px: tuple[int, int] | None = None,
+        unit_mm: float = 1.0,
+        camera: str | None = None,
+        **fields: Any,
     ) -> Self:
-        """Read a camera from a calibration file of OpenCV (`cv2.FileStorage`), ROS (`camera_info`) or a script.
+        """Read a camera from a calibration file of OpenCV (`cv2.FileStorage`), ROS, Kalibr (one camera) or a script.
 
         The file holds a camera matrix, distortion coefficients and, optionally, the image size and the pose (R and T,
         or rvec and tvec) in the world of this package: x_cam = R x_world + t.
@@ -177,16 +213,17 @@ class Camera(Spec):
             path: the file.
             size_px: width and height of the image, if the file does not state them.
             unit_mm: the file's unit of length in mm.
+            camera: key of the camera, in a file of several (Kalibr's cam0).
             fields: `name`; instead of the file's pose, `position_mm`, `look_at_mm`, `pan_deg`, `tilt_deg`, `roll_deg`.
 
         Raises:
             InputError: the file cannot be read, lacks a value, uses an unsupported distortion model, or has a key that
                 may describe the lens and is not read.
         """
-        size = size_px or read_opencv(path).size_px
+        size = size_px or read_opencv(path, camera).size_px
         if size is None:
             raise InputError("does not say the size of the image; give size_px", source=str(path))
-        calibration = {"file": str(path), "unit_mm": unit_mm}
+        calibration = {"file": str(path), "unit_mm": unit_mm, "camera": camera}
         return cls.from_mapping({"resolution_px": size, "calibration": calibration, **fields}).resolved()
 
     def resolved(self, base: Path | None = None) -> Self:
@@ -198,7 +235,7 @@ class Camera(Spec):
         if not isinstance(self.calibration, CalibrationFile):
             return self
         path = (base or Path()) / self.calibration.file
-        found = read_opencv(path)
+        found = read_opencv(path, self.calibration.camera)
         if found.size_px not in (None, self.resolution_px):
             raise InputError(
                 f"is for {found.size_px} px, but resolution_px of the camera is {self.resolution_px}", source=str(path)
@@ -210,8 +247,9 @@ class Camera(Spec):
             raise InputError("holds no pose; give position_mm and look_at_mm of the camera", source=str(path))
         else:
             R, t = found.R, found.t * self.calibration.unit_mm
-        numbers = {"K": found.K, "R": R, "t_mm": t, "distortion": found.distortion}
-        kept = {"name": self.name, "resolution_px": self.resolution_px, "mirror": self.mirror, "eyes": self.eyes}
+        numbers = {"K": found.K, "R": R, "t_mm": t, "distortion": distortion_data(found.distortion)}
+        names = ("name", "resolution_px", "mirror", "eyes", "flip", "relative_illumination")
+        kept = {name: getattr(self, name) for name in names}
         return type(self).from_mapping({**kept, "calibration": numbers}, source=str(path))
 
     @classmethod
@@ -244,13 +282,13 @@ class Camera(Spec):
         placed = {name for name in (*_PLACE, *_LENS) if getattr(self, name) is not None}
         if isinstance(self.calibration, CalibrationFile):
             wrong = sorted(placed & _LENS)
-            if wrong or any(self.distortion):
+            if wrong or is_distorted(coefficients_of(self.distortion)):
                 raise ValueError(f"the calibration file gives the lens; remove {', '.join(wrong) or 'distortion'}")
             if self.position_mm is None and (placed or self.roll_deg != 0):
                 raise ValueError("give position_mm with the direction, or neither")
             return self._checked_direction()
         if self.calibration is not None:
-            if placed or self.roll_deg != 0 or any(self.distortion):
+            if placed or self.roll_deg != 0 or is_distorted(coefficients_of(self.distortion)):
                 raise ValueError("a calibration gives position, direction and lens; remove the other keys")
             return self
         if self.position_mm is None:
@@ -275,8 +313,10 @@ class Camera(Spec):
         Raises:
             InputError: the camera lies in the plane of its mirror, or its calibration file cannot be read.
         """
-        camera = replace(self.unmirrored(), eyes=self.eyes)
-        return camera if self.mirror is None else camera.seen_in(self.mirror)
+        table = None if self.relative_illumination is None else frozen(self.relative_illumination)
+        camera = replace(self.unmirrored(), eyes=self.eyes, relative_illumination=table)
+        camera = camera if self.mirror is None else camera.seen_in(self.mirror)
+        return camera if self.flip is None else camera.flipped()
 
     def unmirrored(self) -> PinholeCamera:
         """Build the numeric camera at its real position, without the mirror."""
@@ -296,7 +336,7 @@ class Camera(Spec):
         cx, cy = self.principal_point_px or ((width - 1) / 2, (height - 1) / 2)
         position = np.array(self.position_mm, dtype=float)
         if self.look_at_mm is not None:
-            axes = _facing(np.array(self.look_at_mm, dtype=float) - position)
+            axes = facing(np.array(self.look_at_mm, dtype=float) - position)
         else:
             axes = _turned(np.radians(self.pan_deg or 0.0), np.radians(self.tilt_deg or 0.0))
         roll = np.radians(self.roll_deg)
@@ -308,17 +348,20 @@ class Camera(Spec):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PinholeCamera(ArrayValue):
-    """A pinhole camera with lens distortion.
+    """A camera with one centre of projection: a pinhole with lens distortion, or a fisheye.
 
     Attributes:
         K: (3, 3) camera matrix, px.
         R: (3, 3) rotation, world to camera.
         t: (3,) translation, world to camera, mm.
-        distortion: (k1, k2, p1, p2, k3).
+        distortion: coefficients (5,), (6,) or (8,) of a model of `distortion.py`.
         resolution_px: (w, h).
         name: name of the camera.
         mirrored: whether it is the virtual camera behind a plane mirror: u is flipped about the principal point.
         eyes: eyes that it sees; None: both.
+        flip: whether the stored picture is turned left to right. K, distortion and `mirrored` are then those of the
+            stored picture; `unflipped` is the camera before the flip.
+        relative_illumination: (n, 2) angles from the axis (deg) and shares, in place of the projection's fall-off.
     """
 
     K: Floats
@@ -329,6 +372,8 @@ class PinholeCamera(ArrayValue):
     name: str
     mirrored: bool = False
     eyes: tuple[Side, ...] | None = None
+    flip: bool = False
+    relative_illumination: Floats | None = None
 
     @classmethod
     def of(
@@ -337,13 +382,56 @@ class PinholeCamera(ArrayValue):
         R: ArrayLike,
         t: ArrayLike,
         resolution_px: tuple[int, int],
-        distortion: ArrayLike = (0, 0, 0, 0, 0),
+        distortion: Any = (0, 0, 0, 0, 0),
         name: str = "camera",
     ) -> PinholeCamera:
-        """Create a camera from array-like values."""
-        return cls(
-            K=frozen(K), R=frozen(R), t=frozen(t), distortion=frozen(distortion), resolution_px=resolution_px, name=name
-        )
+        """Create a camera from array-like values; the distortion may have the form of scenes and JSON."""
+        K, R, t, k = frozen(K), frozen(R), frozen(t), coefficients_of(distortion)
+        return cls(K=K, R=R, t=t, distortion=k, resolution_px=resolution_px, name=name)
+
+    @classmethod
+    def from_labels(cls, data: Mapping[str, Any]) -> PinholeCamera:
+        """Create the camera of an image from `labels.camera`."""
+        size = tuple(data["resolution_px"])
+        camera = cls.of(data["K"], data["R"], data["t_mm"], (size[0], size[1]), data["distortion"])
+        camera = replace(camera, mirrored=data.get("mirrored") is True)
+        return camera.flipped() if data.get("flip") else camera
+
+    def to_mapping(self, translation: str = "t") -> dict[str, Any]:
+        """Return the numbers of a camera in JSON, those before a flip; `translation` is the key of t."""
+        own = self.unflipped
+        return {
+            "K": own.K.tolist(),
+            "R": own.R.tolist(),
+            translation: own.t.tolist(),
+            "distortion": distortion_data(own.distortion),
+            "resolution_px": list(own.resolution_px),
+            "mirrored": own.mirrored or None,
+            "flip": "horizontal" if self.flip else None,
+        }
+
+    def flipped(self) -> PinholeCamera:
+        """Return the camera whose pictures are those of this one turned left to right: u -> W - 1 - u."""
+        K, k = self.K.copy(), self.distortion.copy()
+        K[0, 2] = self.resolution_px[0] - 1 - K[0, 2]
+        p2 = 5 if self.is_fisheye else 3
+        k[p2] = 0.0 - k[p2]
+        return replace(self, K=frozen(K), distortion=frozen(k), mirrored=not self.mirrored, flip=not self.flip)
+
+    def turned(self, window: Window) -> Window:
+        """Return a window of the picture turned left to right, which shows the same."""
+        x0, y0, width, height = window
+        return self.resolution_px[0] - x0 - width, y0, width, height
+
+    @property
+    def unflipped(self) -> PinholeCamera:
+        """The camera before its picture is turned left to right."""
+        return self.flipped() if self.flip else self
+
+    @property
+    def is_fisheye(self) -> bool:
+        """Whether the lens is a fisheye, which images directions up to 110 degrees from its axis."""
+        return is_fisheye(self.distortion)
 
     def seen_in(self, mirror: Mirror) -> PinholeCamera:
         """Return the virtual camera behind a mirror, whose images equal those of this camera through the mirror.
@@ -397,17 +485,35 @@ class PinholeCamera(ArrayValue):
             points_mm: (..., 3) mm, world.
 
         Returns:
-            Pixels (..., 2), NaN behind the camera, and whether the point is in front of it (...).
+            Pixels (..., 2), NaN where there is no image, and whether the point is in front of the camera (...): z > 0,
+            or less than 110 degrees from the axis of a fisheye.
         """
-        cam = np.asarray(points_mm, dtype=float) @ self.R.T + self.t
-        front = cam[..., 2] > 0
-        z = np.where(front, cam[..., 2], np.nan)
-        return self.pixels_of(cam[..., 0] / z, cam[..., 1] / z), front
+        x, y, front = self.plane(np.asarray(points_mm, dtype=float) @ self.R.T + self.t)
+        return self.pixels_of(x, y), front
+
+    def plane(self, points: Floats) -> tuple[Floats, Floats, Bools]:
+        """Compute the coordinates that the distortion maps, from points or directions (..., 3) in the camera's frame.
+
+        Returns:
+            x and y (...): X/Z and Y/Z, or for a fisheye the angle from the axis times (X, Y) / |(X, Y)|; NaN where the
+            lens has no image; and whether it has one (...).
+        """
+        x, y, z = (points[..., k] for k in range(3))
+        if not self.is_fisheye:
+            front = z > 0
+            z = np.where(front, z, np.nan)
+            return x / z, y / z, front
+        across = np.hypot(x, y)
+        angle = np.arctan2(across, z)
+        front = angle <= FARTHEST_RAD
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(front, np.where(across > 0, angle / across, 1 / z), np.nan)
+        return scale * x, scale * y, front
 
     def pixels_of(self, x: Floats, y: Floats) -> Floats:
-        """Compute pixels (..., 2) from undistorted normalised coordinates x = X/Z, y = Y/Z."""
+        """Compute pixels (..., 2) from the coordinates of `plane`."""
         x = self.across * x
-        if np.any(self.distortion):
+        if is_distorted(self.distortion):
             x, y = distort(x, y, self.distortion)
         return np.stack([self.K[0, 0] * x + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]], axis=-1)
 
@@ -416,36 +522,115 @@ class PinholeCamera(ArrayValue):
         distance = float(np.linalg.norm(np.asarray(point_mm, dtype=float) - self.nodal_point_mm))
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1])) / distance
 
-    def rays(self, pixels: ArrayLike) -> Floats:
-        """Compute unit directions (..., 3) in the world, out of the camera, through pixels (..., 2)."""
+    def undistorted(self, pixels: ArrayLike) -> tuple[Floats, Floats]:
+        """Compute the coordinates of `plane` (with the image's sign of x) from pixels (..., 2); NaN without a ray."""
         p = np.asarray(pixels, dtype=float)
         x = (p[..., 0] - self.K[0, 2]) / self.K[0, 0]
         y = (p[..., 1] - self.K[1, 2]) / self.K[1, 1]
-        if np.any(self.distortion):
-            x, y = undistort(x, y, self.distortion)
+        return undistort(x, y, self.distortion) if is_distorted(self.distortion) else (x, y)
+
+    def rays(self, pixels: ArrayLike) -> Floats:
+        """Compute unit directions (..., 3) in the world, out of the camera, through pixels (..., 2)."""
+        x, y = self.undistorted(pixels)
+        if self.is_fisheye:
+            angle = np.hypot(x, y)
+            share = np.sinc(angle / np.pi)
+            return np.asarray(np.stack([share * x, share * y, np.cos(angle)], axis=-1) @ self.sensor_axes)
         d = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.sensor_axes
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
-    def ideal(self, pixels: ArrayLike) -> Floats:
-        """Remove the lens distortion from pixels (..., 2)."""
-        p = np.asarray(pixels, dtype=float)
-        if not np.any(self.distortion):
-            return p
-        (cx, cy), (fx, fy) = self.K[:2, 2], (self.K[0, 0], self.K[1, 1])
-        x, y = undistort((p[..., 0] - cx) / fx, (p[..., 1] - cy) / fy, self.distortion)
-        return np.stack([fx * x + cx, fy * y + cy], axis=-1)
+    def flattened(self, pixel: ArrayLike) -> PinholeCamera:
+        """Return a camera at the same place without distortion; that of a fisheye looks along the ray of a pixel (2,).
+
+        `ideal` gives its pixels.
+        """
+        flat = replace(self, distortion=frozen(np.zeros(5)))
+        if not self.is_fisheye:
+            return flat
+        R = facing(self.rays(pixel)).T
+        return replace(flat, R=frozen(R), t=frozen(-rotated(R, self.nodal_point_mm)), mirrored=False)
+
+    def ideal(self, pixels: ArrayLike, flat: PinholeCamera | None = None) -> Floats:
+        """Remove the lens distortion from pixels (..., 2); for a fisheye, return those of the camera `flat`."""
+        if not is_distorted(self.distortion):
+            return np.asarray(pixels, dtype=float)
+        if flat is not None and self.is_fisheye:
+            return flat.project(self.nodal_point_mm + self.rays(pixels))[0]
+        x, y = self.undistorted(pixels)
+        return np.stack([self.K[0, 0] * x + self.K[0, 2], self.K[1, 1] * y + self.K[1, 2]], axis=-1)
+
+    def depth(self, points_mm: ArrayLike) -> Floats:
+        """Compute the depth (...) of world points (..., 3): mm along the axis, for a fisheye mm from the camera."""
+        points = np.asarray(points_mm, dtype=float)
+        if self.is_fisheye:
+            return np.asarray(np.linalg.norm(points - self.nodal_point_mm, axis=-1))
+        return np.asarray(points @ self.R[2] + self.t[2])
+
+    def stretch(self, cosine: Floats) -> Floats:
+        """Compute the area in the coordinates of `plane` per solid angle, from cosines of angles to the axis.
+
+        1 / cos^3 of a pinhole; theta / sin theta of a fisheye.
+        """
+        return np.asarray(1 / np.sinc(np.arccos(np.clip(cosine, -1, 1)) / np.pi) if self.is_fisheye else 1 / cosine**3)
+
+    def glint_falloff(self, pixels: Floats) -> Floats:
+        """Compute the share of a point's light at pixels (n, 2) per light that the lens' `stretch` spreads there.
+
+        The aperture appears by the cosine narrower, so it is cos^4 of a pinhole and cos(theta) sin(theta) / theta of a
+        fisheye. With `relative_illumination`, which multiplies the whole picture, it is the distortion's area D.
+        """
+        if self.relative_illumination is not None:
+            return np.asarray(distorted_area(*self.undistorted(pixels), self.distortion))
+        cosine = self.rays(pixels) @ self.axis
+        return np.asarray(np.maximum(cosine, 0) / self.stretch(cosine) if self.is_fisheye else cosine**4)
+
+    def illumination(self, window: Window) -> Floats | float:
+        """Compute the relative illumination (h, w) of a window's pixels by `relative_illumination`; 1 without it."""
+        if self.relative_illumination is None:
+            return 1.0
+        x0, y0, width, height = window
+        v, u = np.mgrid[y0 : y0 + height, x0 : x0 + width]
+        angle = np.degrees(np.arccos(np.clip(self.rays(np.stack([u, v], axis=-1)) @ self.axis, -1, 1)))
+        return np.asarray(np.nan_to_num(np.interp(angle, *self.relative_illumination.T)))
+
+    def light_shares(self, point_mm: ArrayLike) -> tuple[float, float]:
+        """Return the light of a surface and of a point at a world point (3,) mm, relative to the lens' axis.
+
+        They are those of a fisheye, or of a lens with `relative_illumination`; 1 for others, which are aimed at eyes.
+        """
+        if not self.is_fisheye and self.relative_illumination is None:
+            return 1.0, 1.0
+        way = rotated(self.R, np.asarray(point_mm, dtype=float) - self.nodal_point_mm)
+        cosine = float(way[2] / np.linalg.norm(way))
+        x, y, _ = self.plane(way)
+        area = float(self.stretch(np.array(cosine)) * distorted_area(self.across * x, y, self.distortion))
+        share = max(cosine, 0.0) / area
+        if self.relative_illumination is not None:
+            share = float(np.interp(np.degrees(np.arccos(np.clip(cosine, -1, 1))), *self.relative_illumination.T))
+        return share, share * area
+
+    def corners(self, window: Window, depth_mm: float) -> Floats:
+        """Compute the corners (5, 3) in the world of a window at a depth (see `depth`), closed.
+
+        Corners without a ray are moved towards the principal point.
+        """
+        x0, y0, w, h = window
+        left, top, right, bottom = x0 - 0.5, y0 - 0.5, x0 + w - 0.5, y0 + h - 0.5
+        off = np.array([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]) - self.K[:2, 2]
+        size = np.hypot(*(off / np.diag(self.K)[:2]).T)
+        off *= np.minimum(0.99 * self.fold[1] / np.maximum(size, 1e-9), 1.0)[:, None] if self.fold[1] < np.inf else 1.0
+        rays = self.rays(off + self.K[:2, 2])
+        along = np.ones(5) if self.is_fisheye else rays @ self.axis
+        return np.asarray(self.nodal_point_mm + depth_mm * rays / along[:, None])
 
     def is_imaged(self, x: Floats, y: Floats) -> Bools:
-        """Return whether the distortion is invertible at normalised coordinates x = X/Z, y = Y/Z (not folded back)."""
+        """Return whether the distortion is invertible at coordinates of `plane` (not folded back)."""
         return np.asarray(is_imaged(self.across * x, y, self.distortion))
 
     @property
     def fold(self) -> tuple[float, float]:
-        """Radius at which a radial distortion folds the image back, without and with it; inf if it does not fold."""
-        k1, k2, _, _, k3 = self.distortion
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-        r2 = float(roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)].min(initial=np.inf))
-        return (r2**0.5, r2**0.5 * (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))) if r2 < np.inf else (np.inf, np.inf)
+        """Radius beyond which a radial distortion images nothing, without and with it; inf if it images everything."""
+        return fold_radius(self.distortion)
 
     def without_rays(self, window: Window) -> Bools | None:
         """Return which pixels (h, w) of a window lie beyond the fold of the lens; None if none does."""
@@ -474,66 +659,6 @@ def beyond_window(window: Window, pixels: Floats) -> float:
     return float(np.maximum(low - pixels, pixels - (low + window[2:])).max(initial=0.0))
 
 
-def distort(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
-    """Apply the Brown-Conrady distortion as OpenCV defines it; works on arrays of NumPy and of Dr.Jit.
-
-    x'' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and alike for y
-    """
-    k1, k2, p1, p2, k3 = k
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
-
-
-def distortion_jacobian(x: Any, y: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any, Any]:
-    """Compute the Jacobian of `distort` at undistorted coordinates: dx''/dx, dx''/dy = dy''/dx, dy''/dy.
-
-    Like `newton_step`, it takes arrays of NumPy and of Dr.Jit.
-    """
-    k1, k2, p1, p2, k3 = k
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
-    a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    d = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return a, b, d
-
-
-def distorted_area(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
-    """Compute the determinant D of `distortion_jacobian`: area on the sensor per area without distortion."""
-    a, b, d = distortion_jacobian(x, y, k)
-    return a * d - b * b
-
-
-def is_imaged(x: Any, y: Any, k: Sequence[Any] | Floats) -> Any:
-    """Return whether the distortion has not folded the image back: its Jacobian is positive definite."""
-    a, b, d = distortion_jacobian(x, y, k)
-    return (a > 0) & (a * d - b * b > 0)
-
-
-def newton_step(x: Any, y: Any, xd: Any, yd: Any, k: Sequence[Any] | Floats) -> tuple[Any, Any]:
-    """Compute the Newton step of `undistort` from (x, y) towards the distorted (xd, yd); subtract it from (x, y)."""
-    fx, fy = distort(x, y, k)
-    ex, ey = fx - xd, fy - yd
-    a, b, d = distortion_jacobian(x, y, k)
-    det = a * d - b * b
-    return (d * ex - b * ey) / det, (a * ey - b * ex) / det
-
-
-def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[Floats, Floats]:
-    """Invert `distort` by Newton's method on its exact Jacobian; NaN where it does not converge."""
-    x, y = xd.copy(), yd.copy()
-    for _ in range(iterations):
-        dx, dy = newton_step(x, y, xd, yd, k)
-        x, y = x - dx, y - dy
-        if np.nanmax(np.hypot(dx, dy), initial=0.0) < 1e-15:
-            break
-    fx, fy = distort(x, y, k)
-    bad = ~(np.hypot(fx - xd, fy - yd) < 1e-12)
-    return np.where(bad, np.nan, x), np.where(bad, np.nan, y)
-
-
 def _turned(pan: float, tilt: float) -> Floats:
     """Return camera axes as columns: tilted about the right axis, then panned about the world's vertical."""
     ct, st, cp, sp = np.cos(tilt), np.sin(tilt), np.cos(pan), np.sin(pan)
@@ -543,7 +668,7 @@ def _turned(pan: float, tilt: float) -> Floats:
     return np.asarray(about_up @ _REST @ about_right)
 
 
-def _facing(direction: Floats) -> Floats:
+def facing(direction: Floats) -> Floats:
     """Return camera axes as columns, looking along `direction` with the world's z up (its y when looking along z)."""
     forward = direction / np.linalg.norm(direction)
     up = np.array([0.0, 0, 1.0]) if abs(forward[2]) < 1 - 1e-9 else np.array([0.0, 1.0, 0.0])

@@ -199,6 +199,9 @@ def recorded(
     sensor: Sensor, camera: PinholeCamera, window: Window, irradiance: Reals, wavelength_nm: float, seed: int
 ) -> NDArray[np.uint16]:
     """Compute the stored codes (h, w) of a window of a camera's sensor, sharpened and with its border; see `expose`."""
+    if camera.flip:
+        before = camera.unflipped, camera.turned(window), irradiance[:, ::-1]
+        return np.ascontiguousarray(recorded(sensor, *before, wavelength_nm, seed)[:, ::-1])
     codes = sharpened(sensor, expose(sensor, irradiance, wavelength_nm, seed, window[:2]))
     if any(sensor.border_px):
         codes[border(sensor, camera, window)] = round(sensor.border_dn)

@@ -1,7 +1,8 @@
-"""Read camera calibrations written by OpenCV, ROS and scripts.
+"""Read camera calibrations written by OpenCV, ROS, Kalibr and scripts.
 
-OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in YAML.
-All of them are read as plain data, without OpenCV; so are YAML, JSON and .npz files of scripts, with the usual names.
+OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in YAML,
+Kalibr a `camchain.yaml` whose keys are cameras. All of them are read as plain data, without OpenCV; so are YAML, JSON
+and .npz files of scripts, with the usual names.
 A key that may describe the lens and is not read is an error: half a calibration moves features by pixels.
 """
 
@@ -19,11 +20,13 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import InputError, Problems
-from ..base.spec import LARGEST, MAX_YAML_BYTES, parse_yaml
+from ..base.spec import LARGEST, MAX_YAML_BYTES, Spec, parse_yaml
 from ..base.storage.files import parse_json, read_bytes, read_text, shown
+from .distortion import FISHEYE_COUNT, RATIONAL_COUNT, FisheyeDistortion, RationalDistortion, coefficients_of
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
-_SUPPORTED = 5
+_SUPPORTED = 8
+_THIN_PRISM = "; thin prisms and tilted sensors are not supported"
 # Names are compared in lower case, without punctuation.
 _MATRIX = ("cameramatrix", "k", "kk", "intrinsicmatrix", "intrinsics", "mtx", "matrix")
 _DISTORTION = (
@@ -44,14 +47,16 @@ _HARMLESS = """
     rmserror ret error meanerror totalerror reprojectionerror meanreprojectionerror reprojerror rvecs tvecs
     newcameramatrix newcameramtx optimalcameramatrix roi rectificationmatrix projectionmatrix binningx binningy header
     cameraname name id serial serialnumber date time timestamp version fps fisheyemodel
+    camoverlaps rostopic tcamimu tcncnm1 timeshiftcamimu
 """.split()  # noqa: SIM905
 _LIKE_DISTORTION = re.compile(r"dist(?!ance)|coef|tangential|radial|fisheye|^[kps]\d$|^tau")
-_ONLY = "; only k1, k2, p1, p2, k3 of a pinhole camera are supported"
-_FISHEYE = (
-    "four coefficients in a column, without a model, may be a fisheye's, which is not supported; for a pinhole, add "
-    "distortion_model: plumb_bob"
+_UNNAMED = (
+    "four coefficients in a column, without a model, may be a fisheye's; add distortion_model: fisheye, or plumb_bob "
+    "for a pinhole"
 )
-_MODELS = ("plumbbob", "rationalpolynomial", "pinhole", "radtan", "radial", "brownconrady", "opencv", "")
+_MODELS = ("plumbbob", "rationalpolynomial", "rational", "pinhole", "radtan", "radial", "brownconrady", "opencv",
+           "none", "")  # fmt: skip
+_FISHEYES = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kb4")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +65,7 @@ class OpenCvCalibration:
 
     Attributes:
         K: (3, 3) camera matrix, px.
-        distortion: (5,) k1, k2, p1, p2, k3.
+        distortion: coefficients (5,), (6,) or (8,) of a model of `distortion.py`.
         R: (3, 3) rotation, world to camera; None if the file has no pose.
         t: (3,) translation, world to camera, in the file's unit of length; None if the file has no pose.
         size_px: width and height of the image; None if the file does not state them.
@@ -73,8 +78,8 @@ class OpenCvCalibration:
     size_px: tuple[int, int] | None
 
 
-def read_opencv(path: str | Path) -> OpenCvCalibration:
-    """Read the calibration of one camera.
+def read_opencv(path: str | Path, camera: str | None = None) -> OpenCvCalibration:
+    """Read the calibration of one camera; `camera` is its key in a file of several (Kalibr's cam0, cam1, ...).
 
     Raises:
         InputError: the file cannot be read, or uses an unsupported model; the message names the key.
@@ -86,6 +91,26 @@ def read_opencv(path: str | Path) -> OpenCvCalibration:
         if content.startswith(b"PK")
         else _mapping(read_text(path, limit=MAX_YAML_BYTES), source)
     )
+    return calibration_of(_one_camera(found, camera, source), source)
+
+
+def _one_camera(found: dict[str, Any], camera: str | None, source: str) -> dict[str, Any]:
+    """Return the keys of one camera of a file whose keys are cameras, or those of the file."""
+    cameras = {key: value for key, value in found.items() if isinstance(value, dict) and "intrinsics" in value}
+    if camera is not None and camera not in cameras:
+        raise InputError(f"holds no camera {shown(camera)}, only {shown(', '.join(cameras) or 'one without a name')}",
+                         source=source)  # fmt: skip
+    if camera is None and len(cameras) > 1:
+        raise InputError(f"holds {', '.join(cameras)}; say which, by camera: {min(cameras)}", source=source)
+    return cameras[camera or next(iter(cameras))] if cameras else found
+
+
+def calibration_of(found: dict[str, Any], source: str) -> OpenCvCalibration:
+    """Read the calibration of one camera from keys and values.
+
+    Raises:
+        InputError: naming the key.
+    """
     problems = Problems(source)
     data = _named(found, problems)
     if "p" in data:
@@ -101,11 +126,14 @@ def read_opencv(path: str | Path) -> OpenCvCalibration:
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if K is not None and K.shape in ((9,), (1, 9), (9, 1)):
         K = K.reshape(3, 3)
+    if K is not None and K.shape == (4,):  # Kalibr's fu, fv, pu, pv
+        K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
     if K is None and len(problems) == 0:
         problems.add(f"missing; the file holds {shown(', '.join(k for k, _ in data.values()), 120)}", "camera_matrix")
     elif K is not None and K.shape != (3, 3):
         problems.add("must be a 3 x 3 matrix", key)
-    distortion = _distortion(*array(_DISTORTION), data, problems)
+    own = next((data[name] for name in _DISTORTION if name in data and _is_own(data[name][1])), None)
+    distortion = _own(*own, problems) if own else _distortion(*array(_DISTORTION), data, problems)
     R, t = _pose(array(_ROTATION), array(_TRANSLATION), problems)
     size = _size(data, problems)
     problems.check()
@@ -118,7 +146,8 @@ def _named(found: dict[str, Any], problems: Problems) -> dict[str, tuple[str, An
     data: dict[str, tuple[str, Any]] = {}
     for key, value in found.items():
         inner = {key: value}
-        if isinstance(value, dict) and "data" not in value and _plain(key) in (*_MATRIX, *_DISTORTION):
+        is_group = isinstance(value, dict) and "data" not in value and not _is_own(value)
+        if is_group and _plain(key) in (*_MATRIX, *_DISTORTION):
             inner = value  # the numbers by name, as k1 and fx
         for inner_key, one in inner.items():
             if _plain(str(inner_key)) in data:
@@ -236,39 +265,62 @@ def _array(value: Any, source: str, key: str) -> Floats:
     return np.asarray(found, dtype=float)
 
 
-def _is_model_stated(data: dict[str, tuple[str, Any]], problems: Problems) -> bool:
-    """Return whether the file names its model; report one that is not supported."""
-    stated = [data[name] for name in _MODEL if name in data]
-    for named, model in stated:
-        if _plain(str(model or "")) not in _MODELS:
-            problems.add(f"the model {shown(model)} is not supported{_ONLY}", named)
-    named, fisheye = data.get("fisheyemodel", ("", None))
-    if fisheye not in (0, None):
-        problems.add(f"the fisheye model is not supported{_ONLY}", named)
-    return bool(stated) or fisheye is not None
+def _is_own(value: Any) -> bool:
+    """Return whether a distortion has the form of scenes, with its model."""
+    return isinstance(value, dict) and value.get("model") in ("fisheye", "rational")
+
+
+def _own(key: str, value: Any, problems: Problems) -> Floats:
+    kind: type[Spec] = FisheyeDistortion if value["model"] == "fisheye" else RationalDistortion
+    try:
+        return coefficients_of(kind.from_mapping(value))
+    except InputError as error:
+        problems.add(error.reason, f"{key}.{error.path}" if error.path else key)
+        return np.zeros(5)
+
+
+def _model(data: dict[str, tuple[str, Any]], problems: Problems) -> str | None:
+    """Return the model that the file names, pinhole or fisheye; None if it names none. Report one that is unknown."""
+    found = None
+    for named, model in (data[name] for name in _MODEL if name in data):
+        plain = _plain(str(model or ""))
+        if plain in _FISHEYES:
+            found = "fisheye"
+        elif plain in _MODELS:
+            found = found or "pinhole"
+        else:
+            problems.add(f"the model {shown(model)} is not supported; plumb_bob, rational_polynomial and fisheye are",
+                         named)  # fmt: skip
+    _, fisheye = data.get("fisheyemodel", ("", None))
+    return found if fisheye is None else ("fisheye" if fisheye != 0 else found or "pinhole")
 
 
 def _distortion(key: str, found: Floats | None, data: dict[str, tuple[str, Any]], problems: Problems) -> Floats:
-    out = np.zeros(_SUPPORTED)
-    is_stated = _is_model_stated(data, problems)
+    model = _model(data, problems)
+    names = ("k1", "k2", "k3", "k4") if model == "fisheye" else _COEFFICIENTS
     flat = {name: data[_plain(name)] for name in _COEFFICIENTS if _plain(name) in data}
     if flat and found is not None:
         problems.add(f"says the same as {key}; remove one", next(iter(flat.values()))[0])
     elif flat:
         key = ", ".join(named for named, _ in flat.values())
-        found = np.array([_number(flat[name], problems) if name in flat else 0.0 for name in _COEFFICIENTS])
-    if found is None:
-        return out
-    if not is_stated and (found.shape == (4, 1) or list(flat) == ["k1", "k2", "k3", "k4"]):
-        problems.add(_FISHEYE, key)
-    values = found.ravel()
-    if len(values) > len(_COEFFICIENTS):
-        problems.add(f"holds {len(values)} coefficients; OpenCV has at most {len(_COEFFICIENTS)}", key)
+        found = np.array([_number(flat[name], problems) if name in flat else 0.0 for name in names])
+        if unknown := [named for name, (named, _) in flat.items() if name not in names]:
+            problems.add(f"a {model} has only {', '.join(names)}", ", ".join(unknown))
+    if model is None and found is not None and (found.shape == (4, 1) or list(flat) == ["k1", "k2", "k3", "k4"]):
+        problems.add(_UNNAMED, key)
+    values = np.zeros(0) if found is None else found.ravel()
+    if len(values) > len(names):
+        problems.add(f"holds {len(values)} coefficients; the model has at most {len(names)}", key)
+        return np.zeros(5)
+    if model == "fisheye":
+        out = np.zeros(FISHEYE_COUNT)
+        out[: len(values)] = values
         return out
     extra = [_COEFFICIENTS[k] for k in range(_SUPPORTED, len(values)) if values[k] != 0]
     if extra:
-        problems.add(f"{', '.join(extra)} must be 0{_ONLY}", key)
-    out[: min(len(values), _SUPPORTED)] = values[:_SUPPORTED]
+        problems.add(f"{', '.join(extra)} must be 0{_THIN_PRISM}", key)
+    out = np.zeros(RATIONAL_COUNT if np.any(values[5:_SUPPORTED]) else 5)
+    out[: min(len(values), len(out))] = values[: len(out)]
     return out
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..base.arrays import Floats
 from ..base.errors import InputError, InputWarning
 from .camera import Camera, PinholeCamera, Window, serves
+from .distortion import FARTHEST_RAD
 from .light import Lamp
 from .rig import RigGeometry
 from .screen import ScreenPlane
@@ -184,12 +185,14 @@ def fold_warnings(
         dark = [camera.without_rays(window) for window, _ in views[c]]
         reach, limit = camera.fold
         apexes = np.array([apex + _PUPIL_REACH_MM for _, apex in views[c]]).reshape(-1, 3)
-        seen = apexes @ camera.R.T + camera.t
-        outside = (np.hypot(seen[:, 0], seen[:, 1]) > reach * np.abs(seen[:, 2])) & (seen[:, 2] > 0)
-        reason = f"folds the picture back {limit * camera.K[0, 0]:.0f} px from the principal point; "
+        x, y, _ = camera.plane(apexes @ camera.R.T + camera.t)
+        outside = np.hypot(x, y) > reach
+        ends = reach == FARTHEST_RAD
+        what = "ends the picture at 110 degrees," if ends else "folds the picture back"
+        reason = f"{what} {limit * camera.K[0, 0]:.0f} px from the principal point; "
         if outside.any() or any(one is not None and one.all() for one in dark):
             raise InputError(f"{reason}an eye lies beyond", path=camera_paths[c])
-        if any(one is not None for one in dark):
+        if any(one is not None for one in dark) and not ends:
             reason += "pixels beyond are black, and class 4 of masks"
             found.append(InputWarning(code="fold", reason=reason, path=camera_paths[c]))
     return found

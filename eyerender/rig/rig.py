@@ -201,19 +201,7 @@ class RigGeometry(ArrayValue):
         """Convert to the mapping that `features --json` writes (see docs/formats.md)."""
         screen = self.screen
         return {
-            "cameras": [
-                {
-                    "K": c.K.tolist(),
-                    "R": c.R.tolist(),
-                    "t": c.t.tolist(),
-                    "distortion": c.distortion.tolist(),
-                    "resolution_px": list(c.resolution_px),
-                    "mirrored": c.mirrored or None,
-                    "flip": None,
-                    "eyes": _listed(c.eyes),
-                }
-                for c in self.cameras
-            ],
+            "cameras": [{**c.to_mapping(), "eyes": _listed(c.eyes)} for c in self.cameras],
             "lights_mm": [light.position_mm.tolist() for light in self.lights],
             "light_eyes": [_listed(light.eyes) for light in self.lights],
             "screen": None

@@ -668,9 +668,11 @@ def _exposed(spec: SceneSpec, rig: RigGeometry) -> Sensor:
     albedo, ambient = spec.look.iris_albedo, spec.ambient.irradiance_w_m2
     brightest, lit = 0.0, False
     for side, y in (("right", -half), ("left", half)):
-        if side in spec.subject.eyes and any(camera.sees(side) for camera in rig.cameras):
-            lamps = [rig.lights[k] for k in rig.lights_of(EYES.index(side))]
-            brightest = max(brightest, iris_radiance(lamps, head + np.array([0.0, y, 0.0]), albedo, ambient))
+        cameras = [camera for camera in rig.cameras if camera.sees(side)]
+        if side in spec.subject.eyes and cameras:
+            lamps, place = [rig.lights[k] for k in rig.lights_of(EYES.index(side))], head + np.array([0.0, y, 0.0])
+            share = max(camera.light_shares(place)[0] for camera in cameras)
+            brightest = max(brightest, share * iris_radiance(lamps, place, albedo, ambient))
             lit |= bool(lamps)
     return automatic_exposure(spec.sensor, brightest, lit=lit, wavelength_nm=spec.wavelength_nm)
 

@@ -17,7 +17,8 @@ from eyerender.optics.solve import apparent_points
 from eyerender.optics.surfaces import components, join
 from eyerender.optics.trace import inward_path, trace
 from eyerender.optics.transforms import normalize, tilt_rotation
-from eyerender.rig.camera import PinholeCamera, distort
+from eyerender.rig.camera import PinholeCamera
+from eyerender.rig.distortion import distort
 from tests.support.paths import load
 
 # Reference world (X, Y, Z) = (y, z, x).

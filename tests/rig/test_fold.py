@@ -9,7 +9,8 @@ import yaml
 import eyerender as er
 from eyerender.cli.main import run
 from eyerender.folders.imagefolder import ImageFolder
-from eyerender.rig.camera import PinholeCamera, distort
+from eyerender.rig.camera import PinholeCamera
+from eyerender.rig.distortion import distort
 
 
 def scene(path, distortion, **camera):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...base.arrays import Bytes, Floats
 from ...base.storage.files import parse_json
 from ...optics.ellipse import Ellipse, signed_distance
+from ...rig.camera import PinholeCamera
 from ...scene.parts import BACKGROUND
 
 CONDITIONS = {
@@ -65,8 +66,8 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
         out.add("pupil > 6.5 mm")
     if camera is None or "pupil_centre_mm" not in world:
         return out
-    R, t, K = (np.asarray(camera[key], dtype=np.float64) for key in ("R", "t_mm", "K"))
-    apex, lens = np.asarray(world["pupil_centre_mm"]), -R.T @ t
+    seen_by = PinholeCamera.from_labels(camera)
+    apex, lens = np.asarray(world["pupil_centre_mm"]), seen_by.nodal_point_mm
     toward = lens - apex
     distance = float(np.linalg.norm(toward))
     if math.degrees(math.acos(float(np.asarray(world["optic_axis"]) @ toward) / distance)) > 50.0:
@@ -74,7 +75,7 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
     scene = parse_json(parameters.get("scene_json") or "{}", path="scene_json")
     sensor, motion, ambient = (scene.get(key) or {} for key in ("sensor", "motion", "ambient"))
     speed_px_ms = math.radians(math.hypot(*motion.get("eye_deg_s", (0.0, 0.0)))) * 1e-3
-    speed_px_ms *= _ROTATION_MM * float(K[0, 0]) / distance
+    speed_px_ms *= _ROTATION_MM * float(seen_by.K[0, 0]) / distance
     if speed_px_ms * float(sensor.get("exposure_ms") or 0.0) > _MOVES_PX:
         out.add("motion")
     if speed_px_ms * float(sensor.get("field_delay_ms") or 0.0) > _MOVES_PX:
@@ -83,8 +84,7 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
         out.add("strong JPEG")
     mirror = np.asarray(world["cornea_centre_mm"]), np.asarray(world["cornea_apex_mm"]), lens
     for panel in ambient.get("panels", ()):
-        seen = K @ (R @ _mirrored(panel, *mirror).T + t[:, None])
-        places = (seen[:2] / seen[2]).T - corner
+        places = seen_by.project(_mirrored(panel, *mirror))[0] - corner
         if pupil is not None and np.any(signed_distance(pupil, places) < 0.0):
             out.add("window in the pupil")
     return out

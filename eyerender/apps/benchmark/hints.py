@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ...base.errors import InputError
-from ...base.spec import NonNegative, Number, Positive, Spec, Vec3
+from ...base.spec import NonNegative, Positive, Spec, Vec3
 from ...base.storage.files import read_json, shown
+from ...rig.distortion import Distortion
 
 HINTS = "hints.json"
 HINTS_SCHEMA = "eyerender/hints/1"
@@ -24,7 +25,7 @@ class RigHints(Spec):
         K: camera matrix, px.
         R: rotation from the world to the camera.
         t_mm: translation from the world to the camera.
-        distortion: OpenCV's coefficients.
+        distortion: as of a camera of a scene.
         lights_mm: positions of the lights in the world.
         eye_mm: approximate position of the eye in the world.
         eye_sd_mm: its standard deviation per axis.
@@ -33,7 +34,7 @@ class RigHints(Spec):
     K: tuple[Vec3, Vec3, Vec3]
     R: tuple[Vec3, Vec3, Vec3]
     t_mm: Vec3
-    distortion: Annotated[tuple[Number, ...], Field(max_length=14)] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=1000)]
     eye_mm: Vec3
     eye_sd_mm: NonNegative = 5.0

@@ -18,6 +18,7 @@ from ...base.storage.jsonlines import JsonLines
 from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ...optics.ellipse import Ellipse
 from ...rig.camera import PinholeCamera
+from ...rig.distortion import distortion_data
 from ...rig.rig import RigGeometry
 from ...scene import Scene
 from ...scene.observation import Observations
@@ -157,7 +158,7 @@ def _hints(
             "K": K.tolist(),
             "R": camera.R.tolist(),
             "t_mm": camera.t.tolist(),
-            "distortion": camera.distortion.tolist(),
+            "distortion": distortion_data(camera.distortion),
             **({"mirrored": True} if camera.mirrored else {}),
             "lights_mm": lights.tolist(),
             "eye_mm": eye_mm.tolist(),
@@ -173,9 +174,7 @@ def _camera_and_lights(
     labels = line.get("labels") or {}
     own, lights = labels.get("camera"), labels.get("lights_mm")
     if own and lights is not None:
-        seen = PinholeCamera.of(own["K"], own["R"], own["t_mm"], tuple(own["resolution_px"]), own["distortion"])
-        seen = replace(seen, mirrored=own.get("mirrored") is True)
-        return seen, np.asarray(lights, dtype=np.float64).reshape(-1, 3)
+        return PinholeCamera.from_labels(own), np.asarray(lights, dtype=np.float64).reshape(-1, 3)
     if rig is None or not 0 <= camera < len(rig.cameras):
         return None, np.zeros((0, 3))
     return rig.cameras[camera], np.array([light.position_mm for light in rig.lights]).reshape(-1, 3)

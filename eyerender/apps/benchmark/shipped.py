@@ -123,13 +123,14 @@ def _lights(found: Extraction, rig: Mapping[str, Any] | None) -> list[int | None
         return [None] * len(found.glints)
     camera = PinholeCamera.of(rig["K"], rig["R"], rig["t_mm"], (1, 1), rig["distortion"])
     camera = replace(camera, mirrored=rig.get("mirrored", False))
-    spots = np.array([g.xy_px for g in found.glints])
+    spots, pupil = np.array([g.xy_px for g in found.glints]), found.pupil.ellipse.centre_px
+    flat = camera.flattened(pupil)
     assigned = identify(
-        camera.ideal(spots),
-        camera.ideal(found.pupil.ellipse.centre_px),
-        K=camera.K,
-        R=camera.sensor_axes,
-        t_mm=camera.sensor_offset,
+        camera.ideal(spots, flat),
+        camera.ideal(pupil, flat),
+        K=flat.K,
+        R=flat.sensor_axes,
+        t_mm=flat.sensor_offset,
         lights_mm=rig["lights_mm"],
         eye_mm=rig["eye_mm"],
         position_sd_mm=math.hypot(_PLACE_MM, rig.get("eye_sd_mm", 0.0)),

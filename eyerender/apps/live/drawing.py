@@ -13,7 +13,7 @@ from ...eye.model import EyeModel
 from ...imaging.capture import eye_motion
 from ...region.limbus import lower
 from ...report.style import ANALYTIC, IMAGE, TARGET
-from ...rig.camera import PinholeCamera, Window
+from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
@@ -114,7 +114,7 @@ def _camera(
     width, height = camera.resolution_px
     origin = camera.nodal_point_mm
     distance = float(np.linalg.norm(apex_mm(frames, row) - origin))
-    field_mm = _corners(camera, (0, 0, width, height), 0.2 * distance)
+    field_mm = camera.corners((0, 0, width, height), 0.2 * distance)
     thick = 1.8 if shown else 1.0
     _pyramid(out, origin, field_mm, CAMERA, thick)
     out.line([0.5 * (field_mm[0] + field_mm[1]), origin + (field_mm[0] + field_mm[1] - 2 * origin) * 0.56], CAMERA, 3)
@@ -122,17 +122,9 @@ def _camera(
     if shown:
         index = frames.index
         window = scene.window(number, 0, int(index.eye[row]))
-        depth = float((apex_mm(frames, row) - origin) @ camera.axis)
+        depth = float(camera.depth(apex_mm(frames, row)))
         if depth > 0:
-            _pyramid(out, origin, _corners(camera, window, depth), "#B7A6D6", 1.0)
-
-
-def _corners(camera: PinholeCamera, window: Window, depth_mm: float) -> Floats:
-    """Compute the corners (5, 3) of a window at a depth in front of a camera, closed."""
-    x0, y0, w, h = window
-    left, top, right, bottom = x0 - 0.5, y0 - 0.5, x0 + w - 0.5, y0 + h - 0.5
-    rays = camera.rays(np.array([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]))
-    return np.asarray(camera.nodal_point_mm + depth_mm * rays / (rays @ camera.axis)[:, None])
+            _pyramid(out, origin, camera.corners(window, depth), "#B7A6D6", 1.0)
 
 
 def _pyramid(out: Strokes, origin: Floats, corners: Floats, colour: str, width: float) -> None:

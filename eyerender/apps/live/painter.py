@@ -340,7 +340,7 @@ def _job(frame: Frames, draw: int) -> RenderJob:
     seed = int(np.random.SeedSequence([job.seed, draw]).generate_state(1, np.uint64)[0])
     quiet = job.sensor.model_copy(update={"noise": False, "border_px": (0, 0, 0, 0)})
     clear = job.lens.model_copy(update={"vignetting": 0.0, "glare": 0.0, "ghost": 0.0, "openings": ()})
-    return replace(job, seed=seed, sensor=quiet, lens=clear, labels=False)
+    return replace(job, seed=seed, sensor=quiet, lens=clear, labels=False, flip=False)
 
 
 def developed(job: RenderJob, irradiance: Floats) -> tuple[Reals, NDArray[np.uint16]]:
@@ -358,11 +358,14 @@ def developed(job: RenderJob, irradiance: Floats) -> tuple[Reals, NDArray[np.uin
 def _image(canvas: _Canvas, job: RenderJob, done: RenderedWindow, irradiance: Floats) -> EyeImage:
     """Convert a canvas to an image as the sensor stores it, for the extractor."""
     frame = canvas.order.frame
-    behind, codes = developed(render_job(frame, 0), irradiance)
+    whole = render_job(frame, 0)
+    behind, codes = developed(whole, irradiance)
+    if whole.flip:
+        behind, codes = behind[:, ::-1], np.ascontiguousarray(codes[:, ::-1])
     return EyeImage(
         frame=frame,
         row=0,
-        window=job.window,
+        window=whole.camera.turned(job.window) if whole.flip else job.window,
         counts=stored(frame.scene, codes),
         irradiance=behind.astype(np.float32),
         parts=np.zeros(codes.shape, np.uint8),

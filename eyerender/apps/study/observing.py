@@ -74,10 +74,8 @@ def moved(observations: Observations, seen_by: PinholeCamera, told: PinholeCamer
     """Transfer pupil ellipses and glints to another camera with the same nodal point; covariances are dropped."""
 
     def pixels(places: Floats) -> Floats:
-        cam = seen_by.rays(places) @ told.R.T
-        front = cam[..., 2] > 0
-        z = np.where(front, cam[..., 2], np.nan)
-        return told.pixels_of(cam[..., 0] / z, cam[..., 1] / z)
+        x, y, _ = told.plane(seen_by.rays(places) @ told.R.T)
+        return told.pixels_of(x, y)
 
     pupil, glints = observations.pupil, observations.glints
     n = len(observations)

@@ -19,6 +19,7 @@ from ...base.storage.files import parse_json
 from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, opened_entries
 from ...optics.ellipse import Ellipse, signed_distance
+from ...rig.camera import PinholeCamera
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
 from ..selection import scrambled
 from .encoding import STORED, Encoding
@@ -159,7 +160,11 @@ class Item:
         return [(g["light"], at[0] - x0, at[1] - y0, g["visible"]) for g, at in placed if at is not None]
 
     def pixel_of(self, point_mm: Any) -> Floats:
-        """Project a point (mm, camera frame) to a pixel, without lens distortion."""
+        """Project a point (mm, camera frame) to a pixel, without lens distortion; through a fisheye with it."""
+        camera = PinholeCamera.from_labels(self.line["labels"]["camera"])
+        if camera.is_fisheye:
+            x, y, _ = camera.plane(np.asarray(point_mm, dtype=float) * (camera.across, 1.0, 1.0))
+            return np.asarray(camera.pixels_of(x, y) - self.entry.window[:2])
         K = np.array(self.line["labels"]["camera"]["K"])
         x = K @ np.asarray(point_mm, dtype=float)
         return np.asarray(x[:2] / x[2] - self.entry.window[:2])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...base.arrays import Bools, Floats
 from ...folders.imagefolder import ImageEntry
 from ...imaging.labels import moments_ellipse
-from ...rig.camera import Window, undistort
+from ...rig.camera import PinholeCamera, Window
 from ...scene.parts import FRAME, IRIS, PUPIL
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 from .problems import differences
@@ -105,12 +105,9 @@ def _geometry(entry: ImageEntry, mask: Mask | None) -> Iterator[str]:
 
 def _rays(entry: ImageEntry) -> Floats:
     """Compute unit directions (h, w, 3) out of the camera through the pixels, in the frame of its normals."""
-    (x0, y0, w, h), camera = entry.window, entry.line["labels"]["camera"]
-    K = np.array(camera["K"], dtype=float)
+    (x0, y0, w, h), camera = entry.window, PinholeCamera.from_labels(entry.line["labels"]["camera"])
     v, u = np.mgrid[y0 : y0 + h, x0 : x0 + w].astype(float)
-    x, y = undistort((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.array(camera["distortion"], dtype=float))
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    return np.asarray(camera.rays(np.stack([u, v], axis=-1)) @ camera.sensor_axes.T)
 
 
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:

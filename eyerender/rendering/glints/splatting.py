@@ -39,7 +39,7 @@ def add_shines(shines: Sequence[Shine], picture: Singles, job: RenderJob) -> Non
     if not lit:
         return
     camera, counts = job.camera, [len(shine.spots.energy) for shine in lit]
-    falloff = (camera.rays(np.concatenate([shine.spots.xy_px for shine in lit])) @ camera.axis) ** 4
+    falloff = camera.glint_falloff(np.concatenate([shine.spots.xy_px for shine in lit]))
     for shine, part in zip(lit, np.split(falloff, np.cumsum(counts)[:-1]), strict=True):
         energy, spread = shine.share * shine.spots.energy * part, defocus.disc(shine.blur_px)
         patch, rows, columns = psf.splat(shine.spots.xy_px, energy, job.sensor.psf_sigma_px, job.window, spread)

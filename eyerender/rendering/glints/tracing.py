@@ -6,10 +6,11 @@ The mirror point of each point of an LED comes from `optics.solve`, the ray tube
     E = I(d) F / J                                          irradiance at the nodal point, for each point of the LED
     e = E f_x f_y / cos^3(theta)                            energy of the spot, in radiance times pixels
 
-theta is the angle to the optical axis. Lens distortion moves a spot without changing its energy. An LED of finite size
-is integrated with Gauss-Legendre nodes in r^2 and equal angles, each with its own position and energy. The image of a
-near LED, which spans several pixels, is thus an energy-weighted disc. If the limbus, the globe or something else hides
-a part of an LED, the nodes cover only the visible part (`cutdiscs`).
+theta is the angle to the optical axis; a fisheye has theta / sin(theta) in place of 1 / cos^3(theta). Lens distortion
+moves a spot without changing its energy. An LED of finite size is integrated with Gauss-Legendre nodes in r^2 and equal
+angles, each with its own position and energy. The image of a near LED, which spans several pixels, is thus an
+energy-weighted disc. If the limbus, the globe or something else hides a part of an LED, the nodes cover only the
+visible part (`cutdiscs`).
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from ...optics.solve import mirrored_rays
 from ...optics.surfaces import Surface, components, join
 from ...optics.trace import Crossing
 from ...optics.transforms import normalize, rotated
-from ...rig.camera import PinholeCamera
+from ...rig.camera import PinholeCamera, facing
 from ...rig.light import Lamp
 from ..hits.meshes import MirrorPoints, SurfaceMesh
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
@@ -62,6 +63,10 @@ class GlintTable(ArrayValue):
     energy: Floats
     share: Floats
     visible: Bools
+
+    def flipped(self, last: int) -> GlintTable:
+        """Return the glints in an image turned left to right, whose last column is `last`."""
+        return replace(self, xy_px=frozen(np.array([last, 0]) + self.xy_px * (-1, 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +184,9 @@ class GlintScene:
 
         When the nodal point moves by q, the image of a point at depth z moves by -f q / z. NaN where there is no image.
         """
-        R, n = self.camera.R, len(lights)
+        n = len(lights)
+        # Everything in a fisheye's picture is on the axis of its own.
+        R = facing(self.t - self.camera.nodal_point_mm).T if self.camera.is_fisheye else self.camera.R
         steps = _PARALLAX_MM * np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
         sources = (np.stack([lamp.position_mm for lamp in lights]) - self.t) @ self.M
         reflected = self._reflect(np.tile(sources, (4, 1)), np.repeat(self.eyepoint + steps @ R @ self.M, n, axis=0))
@@ -272,11 +279,10 @@ class GlintScene:
         power = emitters.exponent[which]
         lobe = np.where(power == 0, 1.0, np.where(leaving > 0, leaving ** np.where(power == 0, 1.0, power), 0.0))
         cam = -(paths.leaves @ self.M.T) @ camera.R.T
-        found = paths.found & (cam[:, 2] > 0)
-        z = np.where(found, cam[:, 2], 1.0)
-        x, v = cam[:, 0] / z, cam[:, 1] / z
-        found &= camera.is_imaged(x, v)
-        scale = camera.K[0, 0] * camera.K[1, 1] / z**3
+        x, v, front = camera.plane(cam)
+        found = paths.found & front
+        found &= camera.is_imaged(np.where(found, x, 0.0), np.where(found, v, 0.0))
+        scale = camera.K[0, 0] * camera.K[1, 1] * camera.stretch(np.where(found, cam[:, 2], 1.0))
         strength = emitters.weights * emitters.strength[which]
         tube = np.where(found, paths.cross_section, 1.0)
         energy = np.where(found, strength * lobe * paths.passed / tube * scale, 0.0)

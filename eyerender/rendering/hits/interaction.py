@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ...rig.distortion import is_fisheye
 from ..materials.albedo import sclera_albedo
 from ..materials.gloss import glossy_normal, rippled_film
 from ..records.frame import DeviceFrame
@@ -103,7 +104,7 @@ class SurfaceInteraction:
         Behind the cornea, this is the change of direction that keeps a ray on its point in the plane of the iris while
         the pinhole moves across the optical axis. The image is astigmatic, so two directions of motion are averaged.
         """
-        near = dr.rcp(dr.maximum(self.distance * dr.dot(d, frame.camera.forward), 1e-3))
+        near = dr.rcp(dr.maximum(self.distance * frame.axis_cosine(d), 1e-3))
         if dr.hint(self.lit_inside & (self.opacity < 0.5), exclude=[self, frame, d]):
             near = dr.clip(self._nearness_inside(frame, d), _DEEPEST * near, near)
         return near
@@ -111,9 +112,11 @@ class SurfaceInteraction:
     def _nearness_inside(self, frame: DeviceFrame, d: mi.Vector3f) -> mi.Float:
         """Compute the inverse depth (1/mm) of the plane of the iris behind the cornea."""
         camera, front = frame.camera, frame.surfaces[0]
-        cosine = dr.dot(d, camera.forward)
-        turned = [frame.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in (camera.right, camera.down)]
-        moved = [frame.vector_to_eye(e) for e in (camera.right, camera.down)]
+        # Everything in a fisheye's picture is on the axis of its own.
+        axes = mi.coordinate_system(d) if is_fisheye(camera.distortion) else (camera.right, camera.down)
+        cosine = frame.axis_cosine(d)
+        turned = [frame.vector_to_eye(cosine * (e - d * dr.dot(e, d))) for e in axes]
+        moved = [frame.vector_to_eye(e) for e in axes]
         y, form = front.on_surface(self.point)
         w, none = frame.vector_to_eye(d), mi.Vector3f(0)
         at = []

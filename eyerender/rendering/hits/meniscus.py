@@ -80,8 +80,8 @@ def _bent(frame: DeviceFrame, hit: TriangleHit, view: MeniscusView, o: mi.Vector
     seen = EyeShape(frame=frame).ray_intersect(x + (deep / cosine) * inside, way)
     found = enters & leaves & seen.globe
     # Below the water nothing mirrors the lamps. The distance gives the depth that the point has without water.
-    forward, dry = frame.camera.forward, mi.Float(0)
-    seen.distance = si.distance * (dr.dot(d, forward) / dr.dot(way, forward))
+    dry = mi.Float(0)
+    seen.distance = si.distance * (frame.axis_cosine(d) / frame.axis_cosine(way))
     seen, kept = (replace(s, gloss=dry, mirrored=dry) for s in (seen, si))
     return MeniscusView(si=dr.select(found, seen, kept), d=dr.select(found, way, d))
 

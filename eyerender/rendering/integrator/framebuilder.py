@@ -10,11 +10,11 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ...base.arrays import Cache
 from ...base.errors import InputError
 from ...region.mesh import RegionMesh, region_mesh
+from ...rig.distortion import is_distorted
 from ...rig.imaging import Ambient
 from ..hits.meshes import Meshes, meshed
 from ..materials.albedo import Textures
@@ -122,7 +122,8 @@ class FrameBuilder:
         shadow_maps = None if region is None else ShadowMaps.build(region, host.shadow_map_table)
         structure = Structure(
             surfaces=kinds(job.eye),
-            distorted=bool(np.any(job.camera.distortion)),
+            distorted=is_distorted(job.camera.distortion),
+            measured_falloff=job.camera.relative_illumination is not None,
             obstacles=surroundings.obstructed,
             region=region is not None,
             ambient=job.ambient.model_copy(update={"sun": None}) != Ambient(),

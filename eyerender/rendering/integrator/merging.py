@@ -111,7 +111,7 @@ def _weighted_hit(frame: DeviceFrame, group: PixelGroup, j: mi.UInt32) -> Weight
         own_ray &= ~on_sheet | group.sharp | (x.y * x.y + x.z * x.z < _LIDS_MM * _LIDS_MM)
     if group.layered:
         along = group.ray(frame, dr.select(group.plain, group.in_order(mi.UInt32(0)), j))[1]
-        near = weight * dr.rcp(dr.maximum(hit.t * dr.dot(along, frame.camera.forward), 1e-3))
+        near = weight * dr.rcp(dr.maximum(hit.t * frame.axis_cosine(along), 1e-3))
     return WeightedHit(j=j, hit=hit, on_sheet=on_sheet, weight=weight, near=near, own_ray=own_ray)
 
 

@@ -20,11 +20,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...rig.camera import Window, distort, distorted_area, is_imaged, newton_step
+from ...rig.camera import Window
+from ...rig.distortion import distort, distorted_area, is_fisheye, is_imaged, newton_step
 from ..records.frame import DeviceFrame, sequence
 from .hostdata import BoundFrame
 
 _UNDISTORT_STEPS = 6
+_SMALL_RAD = 1e-4  # below it sin(x) / x is 1 in single precision
 _UNDISTORTED = 1e-4  # largest accepted residual of Newton's method, in units of the focal length
 _CALLS = 3  # pairs of further numbers of a sample
 _LARGEST_GROUP = 4
@@ -184,9 +186,10 @@ def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3
     """Compute the ray through pixel (u, v) in the scene's frame, with pixel centres at integers.
 
     Returns:
-        Origin, unit direction, and the square root of the weight cos^4(theta) / D of its radiance: theta is the angle
-        to the camera's axis, D the area on the sensor per area without distortion. The weight is 0 where the lens forms
-        no image.
+        Origin, unit direction, and the square root of the weight of its radiance, cos(theta) / (A D): theta is the
+        angle to the camera's axis, A is `PinholeCamera.stretch` (1 / cos^3 of a pinhole), D the area on the sensor per
+        area without distortion. The weight is 0 where the lens forms no image. Elsewhere it is 1 for a lens with a
+        measured fall-off, which multiplies the picture.
     """
     fx, fy = frame.camera.focal
     cx, cy = frame.camera.principal
@@ -201,9 +204,19 @@ def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3
         area = distorted_area(x, y, k)
         imaged = (dr.abs(residual_x - xd) + dr.abs(residual_y - yd) < _UNDISTORTED) & is_imaged(x, y, k)
         x, y = dr.select(imaged, x, xd), dr.select(imaged, y, yd)
-    d = frame.camera.right * x + frame.camera.down * y + frame.camera.forward
-    inv = dr.rsqrt(dr.squared_norm(d))
-    weight = inv * inv
+    if is_fisheye(k):
+        angle = dr.sqrt(x * x + y * y)
+        sine, cosine = dr.sincos(angle)
+        share = dr.select(angle > _SMALL_RAD, sine / angle, 1)
+        d = (frame.camera.right * x + frame.camera.down * y) * share + frame.camera.forward * cosine
+        weight = dr.sqrt(dr.maximum(cosine, 0) * share)
+    else:
+        d = frame.camera.right * x + frame.camera.down * y + frame.camera.forward
+        inv = dr.rsqrt(dr.squared_norm(d))
+        d, weight = d * inv, inv * inv
     if frame.structure.distorted:
-        weight = dr.select(imaged, weight * dr.rsqrt(area), 0)
-    return frame.camera.centre, d * inv, weight
+        light = mi.Float(1) if frame.structure.measured_falloff else weight * dr.rsqrt(area)
+        weight = dr.select(imaged, light, 0)
+    elif frame.structure.measured_falloff:
+        weight = mi.Float(1)
+    return frame.camera.centre, d, weight

@@ -48,9 +48,11 @@ def export_scene(
         The path of the XML file.
 
     Raises:
-        InputError: the camera's pixels are not square, which Mitsuba's perspective sensor does not support.
+        InputError: the camera is a fisheye or its pixels are not square; Mitsuba's perspective sensor supports neither.
     """
     K = job.camera.K
+    if job.camera.is_fisheye:
+        raise InputError("the camera is a fisheye, which Mitsuba's perspective sensor does not support")
     if abs(K[0, 0] - K[1, 1]) > 1e-6 * K[0, 0]:
         raise InputError("the camera's pixels are not square, which Mitsuba's perspective sensor does not support")
     folder = Path(folder)
@@ -138,6 +140,8 @@ def _notes(job: RenderJob) -> list[str]:
     notes = ["Written by eyerender. Lengths in mm, radiance in mW/mm^2/sr, reflectances at the job's wavelength."]
     if np.any(job.camera.distortion):
         notes.append("The camera's lens distortion is left out.")
+    if job.flip:
+        notes.append("The picture is the one before the camera's flip.")
     if any(lamp.radius_mm > 0 and lamp.lobe_exponent != 1 for lamp in job.lights):
         notes.append("Lamps with a lobe other than cos^1 are shown as Lambertian discs.")
     if any(lamp.radius_mm == 0 for lamp in job.lights):

@@ -21,6 +21,7 @@ from ...optics.surfaces import Surface, Xyz
 from ...optics.surfaces_quadric import Quadric
 from ...optics.transforms import rotated
 from ...region.mesh import sheet_codes
+from ...rig.distortion import is_distorted
 from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
 from ..hits.primary import behind, facing, hit_before
@@ -45,7 +46,7 @@ class Geometry(ArrayValue):
     """What the centres of pixels show; NaN where there is none, None where a kind was not requested.
 
     Attributes:
-        depth: (height, width) mm along the camera's axis to the first surface.
+        depth: (height, width) mm along the camera's axis to the first surface; along the ray of a fisheye.
         normals: (height, width, 3) its unit normals, in the camera's frame (x right, y down, z forward), to the camera.
         iris_coordinates: (height, width, 2) mm toward the nose and up in the plane of the iris, from the centre of the
             stop, of what the pixel shows through the cornea.
@@ -66,6 +67,16 @@ class Geometry(ArrayValue):
                 values[name] = own.copy()
                 values[name][covered] = FRAME if name == "instances" else np.nan
         return replace(self, **{name: sealed(value) for name, value in values.items()})
+
+    def flipped(self) -> Geometry:
+        """Return it turned left to right, with normals in the frame of the turned picture."""
+        values: dict[str, Any] = {}
+        for name in ("depth", "normals", "iris_coordinates", "instances"):
+            own = getattr(self, name)
+            if own is not None:
+                sign = (-1, 1, 1) if name == "normals" else 1
+                values[name] = frozen((own * np.array(sign, own.dtype))[:, ::-1], own.dtype)
+        return replace(self, **values)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -218,7 +229,7 @@ def _on_eye(job: RenderJob, hits: Hits, axes: Floats) -> list[tuple[Indices, Flo
 
 @dataclass(frozen=True, slots=True)
 class _Rays:
-    """Rays from a point (3,) in n directions (three arrays), of length 1 along the camera's axis."""
+    """Rays from a point (3,) in n directions (three arrays), of length 1 along the camera's axis; 1 for a fisheye."""
 
     origin: Floats
     ways: Xyz
@@ -278,8 +289,12 @@ def _rays(job: RenderJob, axes: Floats, rows: Indices | None = None) -> _Rays:
         u, v = x0 + np.arange(width, dtype=float), y0 + np.arange(height, dtype=float)[:, None]
     else:
         u, v = (x0 + rows % width).astype(float), (y0 + rows // width).astype(float)
-    if np.any(camera.distortion):
-        pixels = camera.ideal(np.stack(np.broadcast_arrays(u, v), axis=-1))
+    if is_distorted(camera.distortion):
+        pixels = np.stack(np.broadcast_arrays(u, v), axis=-1)
+        if camera.is_fisheye:
+            ways = np.moveaxis(camera.rays(pixels) @ job.M, -1, 0).reshape(3, -1)
+            return _Rays(rotated(job.M.T, camera.nodal_point_mm - job.t), (ways[0], ways[1], ways[2]))
+        pixels = camera.ideal(pixels)
         u, v = pixels[..., 0], pixels[..., 1]
     x = (u - camera.K[0, 2]) / camera.K[0, 0]
     y = (v - camera.K[1, 2]) / camera.K[1, 1]

@@ -53,6 +53,25 @@ class RenderedWindow(ArrayValue):
     highlights: Bools | None = None
     geometry: Geometry | None = None
 
+    def flipped(self, camera: PinholeCamera) -> RenderedWindow:
+        """Return the window turned left to right; `camera` is that before the flip."""
+        last = camera.resolution_px[0] - 1
+        margins = self.lid_margins_px
+        return replace(
+            self,
+            window=camera.turned(self.window),
+            irradiance=frozen(self.irradiance[:, ::-1], np.float32),
+            dn=frozen(self.dn[:, ::-1], np.uint16),
+            labels=None if self.labels is None else self.labels.flipped(),
+            glints=self.glints.flipped(last),
+            purkinje=tuple((order, table.flipped(last)) for order, table in self.purkinje),
+            lid_margins_px=None
+            if margins is None
+            else {lid: [[last - x, y] for x, y in points] for lid, points in margins.items()},
+            highlights=None if self.highlights is None else frozen(self.highlights[:, ::-1], np.bool_),
+            geometry=None if self.geometry is None else self.geometry.flipped(),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposed(ArrayValue):
@@ -119,7 +138,7 @@ class RawFrame(ArrayValue):
             mirrored = mirrored.behind(covered, job.window)
             highlights = None if highlights is None else frozen(highlights & ~covered, np.bool_)
             geometry = None if geometry is None else geometry.behind(covered)
-        return RenderedWindow(
+        done = RenderedWindow(
             window=job.window,
             irradiance=irradiance,
             dn=sealed(dn),
@@ -133,6 +152,7 @@ class RawFrame(ArrayValue):
             highlights=highlights,
             geometry=geometry,
         )
+        return done.flipped(job.camera) if job.flip else done
 
     def _irradiance(self, exposed: Exposed) -> Singles:
         """Compute the irradiance (height, width) of the window, W/m^2, in one exposure."""
@@ -171,7 +191,9 @@ class RawFrame(ArrayValue):
 
 
 def _framed(picture: Singles, lens: Lens, camera: PinholeCamera, window: Window) -> Singles:
-    """Compute the image (height, width) of a window behind vignetting and openings; the input may be changed."""
+    """Compute the image (height, width) of a window behind fall-off, vignetting and openings; the input may change."""
+    if camera.relative_illumination is not None:
+        picture *= np.asarray(camera.illumination(window), dtype=np.float32)
     if lens.vignetting > 0:
         picture *= defocus.vignette(lens, camera, window)
     return np.asarray(stray.framed(picture, lens, camera, window))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Floats, Reals, Singles
+from ...rig.distortion import is_fisheye
 from .job import LampTable
 from .parameters import FrameParameters, Kind, Parameters, packed, rebuilt
 from .recording import recorded, syntax
@@ -80,6 +81,7 @@ class Structure:
     Attributes:
         surfaces: (kind, tilted) of each refracting surface.
         distorted: whether the camera's lens distorts.
+        measured_falloff: whether the lens' fall-off is measured, so that rays have no weights.
         obstacles: whether anything can block light; the background's plane alone cannot.
         region: whether the eye has a region instead of a background.
         ambient: whether there is light other than that of the lamps.
@@ -88,6 +90,7 @@ class Structure:
 
     surfaces: tuple[tuple[Kind, bool], ...]
     distorted: bool = False
+    measured_falloff: bool = False
     obstacles: bool = True
     region: bool = False
     ambient: bool = False
@@ -184,6 +187,10 @@ class DeviceFrame(FrameParameters):
     def bare(self) -> DeviceFrame:
         """Return the frame without lamps, textures and light, for recordings that remain valid when these change."""
         return replace(self, lights=None, textures=None, caches=Caches())
+
+    def axis_cosine(self, d: mi.Vector3f) -> mi.Float:
+        """Compute depth per distance along a camera ray d: its cosine to the axis; 1 for a fisheye."""
+        return mi.Float(1) if is_fisheye(self.camera.distortion) else dr.dot(d, self.camera.forward)
 
     def point_to_eye(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the scene's frame to the eye frame: M^T (x - t)."""

@@ -66,6 +66,7 @@ class RenderJob(ArrayValue):
         labels: whether to compute raster labels.
         highlights: whether to find the highlights of wet and oily surfaces.
         geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
+        flip: whether to turn the window left to right in the end; camera and window are those before.
         purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
         apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
             a turn about a point 13.5 mm behind the apex.
@@ -98,6 +99,7 @@ class RenderJob(ArrayValue):
     interreflection: bool = True
     highlights: bool = False
     geometry: tuple[str, ...] = ()
+    flip: bool = False
 
     @property
     def anchor_mm(self) -> Floats:

@@ -118,7 +118,7 @@ class CameraParameters:
     """Camera parameters for the kernels.
 
     These are the centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point
-    (px), and the lens distortion (k1, k2, p1, p2, k3).
+    (px), and the coefficients of the lens distortion (`rig/distortion.py`).
     """
 
     centre: Vector

@@ -40,7 +40,7 @@ class Blur:
             InputError: the eye would be blurred over more than 400 px.
         """
         camera, sensor = job.camera, job.sensor
-        depth = float(camera.R[2] @ (job.eye.stop.centre_mm @ job.M.T + job.t) + camera.t[2])
+        depth = float(camera.depth(job.eye.stop.centre_mm @ job.M.T + job.t))
         if job.lens.focus_mm is None or depth <= 0:  # a head behind the camera
             return cls(job, 0.0, False, 0)
         subject = defocus.checked(float(defocus.confusion_px(job.lens, camera, sensor, depth)))
@@ -89,7 +89,7 @@ class Blur:
 def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
     """Compute the nearest and farthest depth (mm) of objects in the window."""
     camera = job.camera
-    middle = float(camera.R[2] @ (np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t) + camera.t[2])
+    middle = float(camera.depth(np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t))
     depths = [middle - _GLOBE_MM, middle]
     if posed is not None:
         points = posed.vertices + job.anchor_mm
@@ -97,6 +97,6 @@ def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
         x0, y0, width, height = job.window
         with np.errstate(invalid="ignore"):
             seen = front & (np.abs((xy - (x0 - 0.5, y0 - 0.5)) / (width, height) - 0.5) < 0.5 + _BESIDE).all(axis=1)
-        z = points[seen] @ camera.R[2] + camera.t[2]
+        z = camera.depth(points[seen])
         depths += [float(z.min()), float(z.max())] if len(z) else []
     return np.array([min(depths), max(depths)])

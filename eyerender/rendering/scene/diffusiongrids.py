@@ -122,8 +122,9 @@ def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -
     camera, whole = job.camera, misses_light(job.lens, job.camera, job.window)
     x0, y0, width, height = (0, 0, *camera.resolution_px) if whole else job.window
     xy, front = camera.project(points)
-    depth = np.maximum((points - camera.nodal_point_mm) @ camera.R[2], 1.0)
-    spare = spare_px + spare_mm * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
+    depth = np.maximum(camera.depth(points), 1.0)
+    widest = 2.0 if camera.is_fisheye else 1.0  # theta / sin theta is at most 2 where a fisheye sees
+    spare = spare_px + spare_mm * widest * float(max(camera.K[0, 0], camera.K[1, 1])) / depth
     with np.errstate(invalid="ignore"):
         inside = np.abs(xy - (x0 + 0.5 * width, y0 + 0.5 * height)) < 0.5 * np.array([width, height]) + spare[..., None]
     return np.asarray(front & inside[..., 0] & inside[..., 1])

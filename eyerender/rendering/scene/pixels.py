@@ -35,8 +35,8 @@ def skin_only_tiles(region: RegionMesh, camera: PinholeCamera, anchor_mm: Floats
     closed = [np.concatenate([c, c[:1]])[None] for c in (hole, region.border)]
     curves = [c for c in (*closed, *region.strands) if c.size]
     hairs = sum(c.size > 0 for c in region.strands[:HAIRS])
-    depth = [float(np.min((c + anchor_mm - camera.nodal_point_mm) @ camera.R[2])) for c in curves]
-    if min(depth) < _NEAREST_MM:
+    depth = [float(np.min(camera.depth(c + anchor_mm))) for c in curves]
+    if min(depth) < _NEAREST_MM or not all(camera.project(c + anchor_mm)[1].all() for c in curves[:2]):
         return nothing
     thick = _HAIR_MM * float(max(camera.K[0, 0], camera.K[1, 1])) / min(depth[2:], default=np.inf)
     reach = _STEP_PX / 2 + _SPARE_PX + thick
@@ -84,12 +84,15 @@ def _thin(depth_mm: float, camera: PinholeCamera) -> bool:
 
 def _mark_hairs(marked: Bools, curves: Floats, radii: Floats, camera: PinholeCamera, window: Window) -> None:
     """Mark the pixels of a window that hairs touch, unless the hairs are thick or too close."""
-    depth = (curves - camera.nodal_point_mm) @ camera.R[2]
+    depth = camera.depth(curves)
     focal = float(max(camera.K[0, 0], camera.K[1, 1]))
     if not curves.size or not _thin(float(depth.min()), camera):
         return
     # Away from the optical axis the image is stretched.
-    thick = radii * focal * np.linalg.norm(curves - camera.nodal_point_mm, axis=-1) / depth**2 + _SLACK_PX
+    way = curves - camera.nodal_point_mm
+    distance = np.linalg.norm(way, axis=-1)
+    stretch = camera.stretch(way @ camera.axis / distance) if camera.is_fisheye else distance / depth
+    thick = radii * focal * stretch / depth + _SLACK_PX
     start, way, ends = _pieces(camera.project(curves)[0] - window[:2], marked.shape, thick)
     half = np.maximum(*ends.T)
     # Along x or y, whichever a piece follows more closely, each pixel has a few pixels across it.
@@ -117,7 +120,7 @@ def _drawn(curves: list[Floats], camera: PinholeCamera, anchor_mm: Floats, windo
     x0, y0, width, height = window
     marked, every = np.zeros((height + 2, width + 2), dtype=bool), True
     for curve in (c for c in curves if c.size):
-        z = (curve + anchor_mm - camera.nodal_point_mm) @ camera.R[2]
+        z = camera.depth(curve + anchor_mm)
         if not _thin(float(z.min()), camera):
             every = False
             continue

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from eyerender.region.look import Look
-from eyerender.rig.camera import Camera, PinholeCamera, distort, distorted_area
+from eyerender.rig.camera import Camera, PinholeCamera
+from eyerender.rig.distortion import distort, distorted_area
 from eyerender.rig.light import Led
 from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of
 

@@ -17,7 +17,10 @@ from tests.support.render_rigs import eye_of, head_rig, job_of, remote_rig
 
 pytestmark = pytest.mark.render
 ALL = ("depth", "normals", "iris_coordinates", "instances")
-DISTORTED = (-0.2, 0.05, 0.001, -0.002, 0.0)
+LENSES = {
+    "distorted": (-0.2, 0.05, 0.001, -0.002, 0.0),
+    "fisheye": (0.05, -0.01, 0.003, -0.001, 0.002, -0.003),
+}
 
 
 def turned(model, rig, side="right", **changes):
@@ -40,12 +43,13 @@ def in_camera(job, points):
 
 
 @pytest.mark.parametrize("model", [pytest.param("E2", marks=pytest.mark.slow), "E5"])
-@pytest.mark.parametrize("kind", ["remote", "headset", "distorted"])
+@pytest.mark.parametrize("kind", ["remote", "headset", "distorted", "fisheye"])
 def test_depth_and_normals_are_those_of_traced_rays(renderer, model, kind):
     rig = remote_rig() if kind == "remote" else head_rig()
     job = turned(model, rig)
-    if kind == "distorted":
-        job = replace(job, camera=replace(job.camera, distortion=np.array(DISTORTED)))
+    if kind in LENSES:
+        job = replace(job, camera=replace(job.camera, distortion=np.array(LENSES[kind])))
+    far = (lambda p: np.linalg.norm(p, axis=-1)) if kind == "fisheye" else (lambda p: p[..., 2])
     window = renderer.render(job, spp=1)
     found, part = window.geometry, window.labels.part
     origin, d = rays(job)
@@ -54,7 +58,7 @@ def test_depth_and_normals_are_those_of_traced_rays(renderer, model, kind):
     clear = (part == IRIS) | (part == PUPIL)
     assert clear.sum() > 500
     on = traced.points_mm[1][clear]
-    np.testing.assert_allclose(found.depth[clear], in_camera(job, on)[:, 2], atol=1e-4, rtol=0)
+    np.testing.assert_allclose(found.depth[clear], far(in_camera(job, on)), atol=1e-4, rtol=0)
     wanted = eye.front[0].normal(on) @ job.M.T @ job.camera.sensor_axes.T
     np.testing.assert_allclose(found.normals[clear], wanted, atol=1e-6, rtol=0)
     assert (found.normals[clear][:, 2] < 0).all()
@@ -65,7 +69,7 @@ def test_depth_and_normals_are_those_of_traced_rays(renderer, model, kind):
     sphere = origin + t[..., None] * d
     white = (part == SCLERA) & (np.linalg.norm(sphere[..., 1:], axis=-1) > float(eye.limbus_radius_mm) + 0.3)
     assert white.sum() > 500
-    np.testing.assert_allclose(found.depth[white], in_camera(job, sphere[white])[:, 2], atol=1e-4, rtol=0)
+    np.testing.assert_allclose(found.depth[white], far(in_camera(job, sphere[white])), atol=1e-4, rtol=0)
     wanted = (sphere[white] - centre) / radius @ job.M.T @ job.camera.sensor_axes.T
     np.testing.assert_allclose(found.normals[white], wanted, atol=1e-6, rtol=0)
 
