@@ -74,6 +74,8 @@ def extract(
     gamma: float | None = None,
     method: Literal["fast", "refined"] = "refined",
     eyes: int = 1,
+    arrangement: Literal["side-by-side", "stacked"] | None = None,
+    order: Literal["right-left", "left-right"] | None = None,
     polarity: Literal["auto", "dark", "bright"] = "auto",
     radius_px: tuple[float, float] | None = None,
     min_confidence: float | None = None,
@@ -95,6 +97,9 @@ def extract(
         gamma: Encoding gamma of the pixel values (default: 1, linear; 8-bit videos are mostly encoded with 2.2).
         method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit.
         eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
+        arrangement: With --eyes 2: each image holds the pictures of two cameras, beside or above each other. The left
+            or upper one shows the subject's right eye.
+        order: With --eyes 2: the subject's eyes from the left, or from above (default: right-left).
         polarity: Whether the pupil is darker or brighter than the iris.
         radius_px: Smallest and largest semi-axis of the pupil.
         min_confidence: Least probability that a pupil is right; others are missing.
@@ -113,7 +118,11 @@ def extract(
     _check_extract(images, gamma, eyes)
     heed = Heed(strict)
     loaded = None if scene is None else heed.scene(scene)
-    settings = _settings(radius_px, min_confidence, method=method, polarity=polarity)
+    both = {"arrangement": arrangement, "order": order}
+    for name, value in both.items():
+        if value is not None and eyes != 2:
+            raise InputError("belongs to --eyes 2", source=f"--{name}")
+    settings = _settings(radius_px, min_confidence, method=method, polarity=polarity, **both)
     observer = ImageObserver(gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera)
     if output is not None:
         refuse_special(output)
@@ -151,14 +160,16 @@ def extract(
     return 0
 
 
-def _settings(radius_px: tuple[float, float] | None, min_confidence: float | None, **given: str) -> ExtractionSettings:
+def _settings(
+    radius_px: tuple[float, float] | None, min_confidence: float | None, **given: str | None
+) -> ExtractionSettings:
     """Return the settings of an extractor from the options of the command."""
     from ..extraction.settings import ExtractionSettings
 
     low, high = radius_px or (None, None)
     numbers = {"radius_min_px": low, "radius_max_px": high, "min_confidence": min_confidence}
     try:
-        return ExtractionSettings.from_mapping(given | {k: v for k, v in numbers.items() if v is not None})
+        return ExtractionSettings.from_mapping({k: v for k, v in (given | numbers).items() if v is not None})
     except InputError as error:
         option = "--min-confidence" if error.path == "min_confidence" else "--radius-px"
         raise InputError(error.reason, source=option) from None

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..base.arrays import Floats
 from .pipeline import extract
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings
@@ -22,48 +23,57 @@ def extract_eyes(
     settings: ExtractionSettings | None = None,
     prior: tuple[PupilResult | None, PupilResult | None] = (None, None),
 ) -> tuple[Extraction, Extraction]:
-    """Extract pupils and glints of both eyes: the eye on the image's left, then the one on its right.
+    """Extract pupils and glints of both eyes: the subject's right eye, then the left one.
 
-    The arguments are those of `extract`, with one `prior` per eye. Positions are relative to the whole image.
+    The arguments are those of `extract`, with one `prior` per eye. The settings say how the image holds the eyes.
+    Positions are relative to the whole image.
     """
-    array = np.asarray(image)
-    if array.ndim < 2 or array.shape[1] < LEAST_WIDTH:
+    array, own = np.asarray(image), settings or ExtractionSettings()
+    axis = 0 if own.arrangement == "stacked" else 1
+    if array.ndim < 2 or array.shape[axis] < LEAST_WIDTH:
         one = extract(array, bit_depth=bit_depth, gamma=gamma, settings=settings)
-        return one, replace(one, pupil=PupilResult.missing("input", "the image is too narrow for two eyes"), glints=())
-    width = array.shape[1]
-    begins = (0, int((0.5 - OVERLAP) * width))
-    parts = (array[:, : width - begins[1]], array[:, begins[1] :])
+        none = PupilResult.missing("input", f"the image is too {'narrow' if axis else 'low'} for two eyes")
+        return one, replace(one, pupil=none, glints=())
+    size, turn = array.shape[axis], -1 if own.order == "left-right" else 1
+    begins = 0, int((0.5 - (OVERLAP if own.arrangement == "face" else 0.0)) * size)
+    ends = size - begins[1], size
+    parts = [array[:, a:b] if axis else array[a:b] for a, b in zip(begins, ends, strict=True)]
+    shifts = [np.array([start, 0.0] if axis else [0.0, start]) for start in begins]
     left, right = (
         _moved(
-            extract(part, bit_depth=bit_depth, gamma=gamma, settings=settings, prior=_shifted(before, -x0)),
-            x0,
-            (array.shape[0], width),
+            extract(part, bit_depth=bit_depth, gamma=gamma, settings=settings, prior=_shifted(before, -shift)),
+            shift,
+            (array.shape[0], array.shape[1]),
         )
-        for part, x0, before in zip(parts, begins, prior, strict=True)
+        for part, shift, before in zip(parts, shifts, prior[::turn], strict=True)
     )
+    if own.arrangement == "face":
+        left, right = _apart(left, right, 0.5 * size)
+    return (left, right) if turn == 1 else (right, left)
+
+
+def _apart(left: Extraction, right: Extraction, middle_px: float) -> tuple[Extraction, Extraction]:
+    """Return the results of both halves of a face; an eye that both show belongs to the side on which it lies."""
     first, second = left.pupil.ellipse, right.pupil.ellipse
     if first is None or second is None or np.hypot(*(first.centre_px - second.centre_px)) > 2.0 * first.semi_axes_px[0]:
         return left, right
-    # Both halves show the same eye. It belongs to the side on which it lies.
     other = PupilResult.missing("coarse search", "only one eye was found, on the other side of the image")
-    if first.centre_px[0] < 0.5 * width:
+    if first.centre_px[0] < middle_px:
         return left, replace(right, pupil=other, glints=(), rejected=())
     return replace(left, pupil=other, glints=(), rejected=()), right
 
 
-def _moved(found: Extraction, x0: int, shape: tuple[int, int]) -> Extraction:
-    """Shift the result of a part that begins at column x0 to coordinates of the whole image."""
-    shift = np.array([float(x0), 0.0])
+def _moved(found: Extraction, shift: Floats, shape: tuple[int, int]) -> Extraction:
+    """Shift the result of a part to coordinates of the whole image."""
     glints, rejected = (
         tuple(replace(one, xy_px=one.xy_px + shift) for one in several) for several in (found.glints, found.rejected)
     )
-    pupil = _shifted(found.pupil, x0)
+    pupil = _shifted(found.pupil, shift)
     assert pupil is not None
     return replace(found, pupil=pupil, glints=glints, rejected=rejected, shape=shape)
 
 
-def _shifted(pupil: PupilResult | None, dx: int) -> PupilResult | None:
+def _shifted(pupil: PupilResult | None, shift: Floats) -> PupilResult | None:
     if pupil is None or pupil.ellipse is None:
         return pupil
-    shift = np.array([float(dx), 0.0])
     return replace(pupil, ellipse=pupil.ellipse.shifted(shift), contour_px=pupil.contour_px + shift)

@@ -45,6 +45,14 @@ class ExtractionSettings(Spec):
         default=4.0, description="search radius for glints around the pupil centre, in semi-axes a"
     )
 
+    arrangement: Literal["face", "side-by-side", "stacked"] = Field(
+        default="face",
+        description="images of both eyes: a view of the face, or pictures of two cameras, beside or above each other",
+    )
+    order: Literal["right-left", "left-right"] = Field(
+        default="right-left", description="the subject's eyes in such an image: from the left, or from above"
+    )
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.radius_min_px, self.radius_max_px

@@ -36,7 +36,7 @@ def follow(
         frames: frames in temporal order.
         gamma: encoding gamma of the levels.
         settings: settings of the extractor.
-        eyes: 1, or 2 for frames with both eyes: that on the image's left, then that on its right.
+        eyes: 1, or 2 for frames with both eyes: the right one, then the left one.
     """
     before: list[PupilResult | None] = [None] * eyes
     for frame in frames:

@@ -145,8 +145,8 @@ class ImageObserver:
             scene: the scene whose rig took the images. With it, files of a folder of this package are seen with their
                 windows.
             progress: called after each image.
-            eyes: 1, or 2 for images of both eyes. The eye on the image's left is then the right eye, as a camera in
-                front of the subject sees it.
+            eyes: 1, or 2 for images of both eyes, arranged as the settings say. By default, the eye on the image's left
+                is the right eye, as a camera in front of the subject sees it.
             processes: number of images processed at the same time.
             pictures: folder for overlays of the results over the images.
             warn: receives a warning if images have colour, and one for each image that is skipped.

@@ -108,6 +108,48 @@ def test_both_eyes_by_the_image_side(drawings):
     assert iou(right.pupil.ellipse, _truth(first).shifted((320.0, 0.0))) > 0.95
 
 
+@pytest.mark.parametrize(("arrangement", "join"), [("side-by-side", np.hstack), ("stacked", np.vstack)])
+@pytest.mark.parametrize("order", [None, "right-left", "left-right"])
+def test_joined_pictures_of_two_cameras(drawings, tmp_path, capsys, arrangement, join, order):
+    """Images and videos: the left or upper picture is the right eye, unless the order is reversed."""
+    pairs = [(drawings[k], drawings[k + 1]) for k in range(2)]
+    frames = [join([first.image, second.image]) for first, second in pairs]
+    for k, frame in enumerate(frames):
+        assert cv2.imwrite(str(tmp_path / f"{k}.png"), frame)
+    height, width = frames[0].shape
+    with VideoWriter(tmp_path / "both.mkv", width, height, 50.0) as writer:
+        for frame in frames:
+            writer.add(np.repeat(frame[..., None], 3, axis=2))
+    shift = np.array([320.0, 0.0] if arrangement == "side-by-side" else [0.0, 240.0])
+    options = ["--eyes", "2", "--arrangement", arrangement, *([] if order is None else ["--order", order])]
+    for files in ([tmp_path / "0.png", tmp_path / "1.png"], [tmp_path / "both.mkv"]):
+        records = tmp_path / "records.jsonl"
+        assert run(["extract", *map(str, files), *options, "-o", str(records)]) == 0
+        lines = [json.loads(line) for line in records.read_text().splitlines()]
+        assert [(line["frame"], line["eye"]) for line in lines] == [(k, e) for k in (0, 1) for e in ("right", "left")]
+        for k, (first, second) in enumerate(pairs):
+            places = [_truth(first).centre_px, _truth(second).centre_px + shift]
+            wanted = places[::-1] if order == "left-right" else places
+            for line, place in zip(lines[2 * k :], wanted, strict=False):
+                assert math.dist(line["pupil"]["centre_px"], place) < 0.1
+    # One eye alone: the other picture has none, and no eye is taken twice.
+    blank = np.full_like(drawings[0].image, 100)
+    assert cv2.imwrite(str(tmp_path / "one.png"), join([blank, drawings[0].image]))
+    assert run(["extract", str(tmp_path / "one.png"), *options, "-o", str(tmp_path / "one.jsonl")]) == 0
+    found = {line["eye"]: line["pupil"]["status"] for line in map(json.loads, (tmp_path / "one.jsonl").open())}
+    there = "right" if order == "left-right" else "left"
+    assert found.pop(there) == "ok"
+    assert list(found.values()) == ["missing"]
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("option", [["--arrangement", "stacked"], ["--order", "left-right"]])
+def test_arrangements_belong_to_two_eyes(drawings, tmp_path, capsys, option):
+    assert cv2.imwrite(str(tmp_path / "0.png"), drawings[0].image)
+    assert run(["extract", str(tmp_path / "0.png"), *option]) == 2
+    assert f"error: {option[0]}: belongs to --eyes 2" in capsys.readouterr().err
+
+
 def test_colour_is_taken_with_one_warning(drawings, tmp_path, capsys):
     drawing = drawings[0]
     colour = np.repeat(drawing.image[..., None], 3, axis=2)
