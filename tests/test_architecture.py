@@ -240,7 +240,7 @@ def lines_of(package: str = "") -> int:
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
     "": 87860,  # what datasets teach by mistake, for those who train; files of other programs, for those who have films
-    "analytic": 735,  # fisheyes, for owners of headsets
+    "analytic": 1045,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 16760,  # two rigs compared, for their makers; dependences that teach something false, for data makers
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
@@ -248,7 +248,7 @@ BOUNDS = {
     "dataset": 10135,  # the codes that cameras stored in every export, shards of a stated size, for trainers
     "design": 3290,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
-    "eye": 3220,
+    "eye": 3840,  # spectacle lenses from prescriptions or as made, and fixation through them, for the same
     "folders": 1845,  # compressed depth and normals, for those who train; what is missing of damaged videos
     "gaze": 5230,  # calibrations that survive blinks; tables of other trackers; rings that lose glints, for headsets
     "imaging": 2305,  # pictures without an eye, for those who train; the camera and window of files
@@ -258,7 +258,7 @@ BOUNDS = {
     "rendering": 12520,
     "report": 970,
     "rig": 3700,  # fisheyes, measured fall-off, flipped pictures, for owners of headsets; files of any writer
-    "scene": 2180,  # instants, people and times in records; names and lengths that are refused where they are written
+    "scene": 2280,  # people, times and lens reflections in records; names and lengths refused where they are written
 }
 
 

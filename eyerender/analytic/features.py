@@ -19,6 +19,7 @@ from ..base.status import Status
 from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
+from ..eye.worn import WornLens
 from ..optics.ellipse import fit_ellipse_direct
 from ..optics.surfaces import Xyz
 from ..rig.camera import PinholeCamera
@@ -131,7 +132,9 @@ def features(
                 view = View.of(turned, pose, position[block], camera)
                 some = np.flatnonzero(lit[block].any(axis=0))
                 for j, order in enumerate(purkinje if len(some) else ()):
-                    exits, residual, status = glint_exits(turned, order, view.into_eye(lights[some]), view.camera_mm)
+                    exits, residual, status = glint_exits(
+                        turned, order, view.into_eye(lights[some]), view.camera_mm, view.lenses
+                    )
                     pixels, status = view.project(exits, status)
                     at, lamp = np.ix_(block, some)
                     glints[at, lamp, j], glint_status[at, lamp, j] = pixels, status
@@ -139,7 +142,7 @@ def features(
                 for inner in slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
                     part, eye, near = block[inner], take_eyes(turned, np.arange(len(block))[inner]), view.rows(inner)
                     # The last point is the stop's centre.
-                    exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm)
+                    exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm, near.lenses)
                     pixels, status = near.project(exits, status)
                     points[part], anatomical[part] = pixels[:, :-1], pixels[:, -1]
                     point_status[part], point_residual[part] = status[:, :-1], residual[:, :-1]
@@ -191,13 +194,17 @@ def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class View:
-    """View of one camera on a batch of turned eyes: x_cam = R x_eye + t for each, and the camera in the eye frame."""
+    """View of one camera on a batch of turned eyes: x_cam = R x_eye + t for each.
+
+    The camera, and the lenses worn, are in the eyes' frames.
+    """
 
     rotation: Floats
     translation: Floats
     camera_mm: Xyz
     motion: tuple[Floats, Floats]
     camera: PinholeCamera
+    lenses: tuple[WornLens, ...]
 
     @classmethod
     def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> View:
@@ -212,6 +219,7 @@ class View:
             camera_mm=(at[0], at[1], at[2]),
             motion=(turn, whole),
             camera=camera,
+            lenses=tuple(lens.turned(turn, shift) for lens in eye.worn),
         )
 
     def rows(self, part: slice) -> View:
@@ -224,6 +232,7 @@ class View:
             camera_mm=(x[part], y[part], z[part]),
             motion=(turn[part], shift[part]),
             camera=self.camera,
+            lenses=tuple(lens.take(np.arange(len(turn))[part]) for lens in self.lenses),
         )
 
     def into_eye(self, points_mm: Floats) -> Xyz:

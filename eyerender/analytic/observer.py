@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -16,8 +16,18 @@ from ..eye.model import EyeModel
 from ..eye.pose import Poses
 from ..optics.ellipse import fit_ellipse_direct
 from ..rig.rig import RigGeometry, RigLike
-from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures
+from ..scene.observation import (
+    EYES,
+    SURFACES,
+    GlintFeatures,
+    Index,
+    LensGlintFeatures,
+    Observations,
+    PoseTruth,
+    PupilFeatures,
+)
 from .features import Features, features
+from .legs import LensImage, lens_images
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0
@@ -111,7 +121,9 @@ class AnalyticObserver:
         frames = frames.seen_by(rig)
         scene, index, pose = frames.scene, frames.index, frames.pose
         eyes, which = scene.eyes_of(index)
-        has = eyes[0].purkinje_orders
+        has = (1,) if eyes[0].worn else eyes[0].purkinje_orders
+        if eyes[0].worn and not set(purkinje) <= {1}:
+            raise InputError("must be 1 behind spectacles, through which images 2 to 4 are not traced", path="purkinje")
         if not set(purkinje) <= set(has):
             raise InputError(
                 f"must be among {', '.join(map(str, has))}: {scene.eye_name} has no other Purkinje images",
@@ -129,7 +141,13 @@ class AnalyticObserver:
             boundary_points=self.boundary_points,
             purkinje=(1, *sorted(set(purkinje) - {1})),
         )
-        observed = Observations(index=index, pose=pose, pupil=pupil_features(seen), glints=glint_features(seen))
+        observed = Observations(
+            index=index,
+            pose=pose,
+            pupil=pupil_features(seen),
+            glints=glint_features(seen),
+            lens_glints=lens_glint_features(scene.rig, eyes, which, index),
+        )
         return observed, seen
 
 
@@ -261,3 +279,46 @@ def glint_features(seen: Features) -> GlintFeatures:
         in_image=seen.glint_in_image[:, :, 0] & (status == Status.OK),
         xy_px=seen.glints_px[:, :, 0],
     )
+
+
+def lens_glint_features(
+    rig: RigGeometry, eyes: Sequence[EyeModel], which: Indices, index: Index
+) -> LensGlintFeatures | None:
+    """Compute the reflections of lamps in the lenses worn; None if nobody wears any.
+
+    Lenses do not turn with the eye, so rows that differ in the fixation only share one search.
+    """
+    if not any(eye.worn for eye in eyes):
+        return None
+    places = index.eye_position_mm + index.head_mm
+    keys, rows, back = np.unique(
+        np.column_stack([index.camera, which, places]), axis=0, return_index=True, return_inverse=True
+    )
+    found = [
+        _images_of(rig, eyes[which[row]], int(index.eye[row]), int(index.camera[row]), places[row]) for row in rows
+    ]
+    shape = len(keys), max(map(len, found))
+    status, light = np.full(shape, Status.NONE, np.int8), np.full(shape, -1)
+    surface, number = np.full(shape, -1), np.full(shape, -1)
+    xy, inside = np.full((*shape, 2), np.nan), np.zeros(shape, dtype=bool)
+    reason = np.full(shape, None, dtype=object)
+    for k, (row, images) in enumerate(zip(rows, found, strict=True)):
+        camera = rig.cameras[index.camera[row]]
+        for j, one in enumerate(images):
+            xy[k, j], front = camera.project(one.seen_mm + places[row])
+            at = Status.BEHIND_CAMERA if one.status == Status.OK and not front else one.status
+            status[k, j], reason[k, j], inside[k, j] = at, at.reason, bool(camera.in_image(xy[k, j]))
+            light[k, j], surface[k, j], number[k, j] = one.lamp, SURFACES.index(one.surface), one.index
+    whole = LensGlintFeatures(
+        status=status, light=light, reason=reason, in_image=inside, xy_px=xy, surface=surface, index=number
+    )
+    return whole.take(back.reshape(-1))
+
+
+def _images_of(rig: RigGeometry, eye: EyeModel, side: int, camera: int, place_mm: Floats) -> list[LensImage]:
+    """Compute the reflections in the lenses of one eye; lamps keep their numbers in the rig."""
+    lights, seen = rig.lights_of(side), rig.cameras[camera].nodal_point_mm - place_mm
+    if not eye.worn or not len(lights):
+        return []
+    lamps = np.array([rig.lights[k].position_mm for k in lights]) - place_mm
+    return [replace(one, lamp=int(lights[one.lamp])) for one in lens_images(eye.worn, lamps, seen)]

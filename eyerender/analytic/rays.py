@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Statuses
+from ..base.arrays import Bools, Floats, Indices, Statuses
 from ..base.status import Status, mark
 from ..eye.model import EyeModel
+from ..eye.worn import WornLens
 from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
-from ..optics.solve import mirrored_rays, refracted_rays
+from ..optics.solve import mirrored_rays
 from ..optics.surfaces import Xyz, components, fit, join, shift, turn
+from .legs import mirrored_legs, refracted_legs
 
 _AHEAD_MM = 500.0
 _ASIDE = 0.1
 _RIM_POINTS = 36
 
 
-def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Compute where the rays from `count` points of the stop's margin, and last from its centre, leave the cornea.
+def pupil_exits(
+    eye: EyeModel, count: int, camera_mm: Xyz, lenses: Sequence[WornLens] = ()
+) -> tuple[Xyz, Floats, Statuses]:
+    """Compute where the camera sees `count` points of the stop's margin, and last its centre.
+
+    These are the points at which their rays leave the cornea or, behind glasses, the outermost lens.
 
     A camera may be behind the plane of the iris, because the cornea refracts light towards it. The status is
     BEHIND_IRIS for a ray that would have to pass the iris, and BEHIND_SCLERA for one that meets the eyeball on its way
@@ -28,9 +36,10 @@ def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats,
         eye: the eyes.
         count: number of points of the margin.
         camera_mm: (n,) nodal points in the eye frame.
+        lenses: lenses worn in front of the eyes, in the eye frame.
 
     Returns:
-        Exit points as three arrays (n, count + 1), residuals and status.
+        These points as three arrays (n, count + 1), residuals and status.
     """
     points = np.concatenate([eye.stop.boundary(count), eye.stop.centre_mm[..., None, :]], axis=-2)
     target, viewpoint = components(points), (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
@@ -45,7 +54,7 @@ def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats,
         ahead = (_AHEAD_MM, 0.0, 0.0)
         x, y, z = (np.where(hidden[:, None], ahead[i], viewpoint[i]) for i in range(3))
         viewpoint = (x, y, z)
-    found = refracted_rays(eye.front, eye.front_indices, target, viewpoint, rim_mm=eye.limbus_radius_mm)
+    found = refracted_legs(eye, lenses, target, viewpoint)
     status, residual = np.array(found.status), np.array(found.residual_mm)
     if aside.any():
         nx, ny, nz = (fit(eye.stop.normal[..., i], 2) for i in range(3))
@@ -54,11 +63,22 @@ def pupil_exits(eye: EyeModel, count: int, camera_mm: Xyz) -> tuple[Xyz, Floats,
         mark(status, aside[:, None] & _meets_sclera(eye, found.exit, found.way), Status.BEHIND_SCLERA)
     status[hidden] = Status.BEHIND_IRIS
     residual[hidden] = np.nan
-    return found.exit, residual, status
+    if lenses:
+        _mark_split(status[:, :-1], found.passed[:, :-1])
+    return found.seen, residual, status
 
 
-def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tuple[Xyz, Floats, Statuses]:
-    """Compute where the light of lamps leaves the cornea towards the camera.
+def _mark_split(status: Statuses, passed: Indices) -> None:
+    """Mark, in place, the fewer points of each margin (n, k) where some are seen through and some beside a lens."""
+    ok = status == Status.OK
+    counts = np.stack([np.count_nonzero(ok & (passed == k), axis=1) for k in range(int(passed.max(initial=0)) + 1)])
+    mark(status, passed != counts.argmax(axis=0)[:, None], Status.AT_LENS_EDGE)
+
+
+def glint_exits(
+    eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz, lenses: Sequence[WornLens] = ()
+) -> tuple[Xyz, Floats, Statuses]:
+    """Compute where the light of lamps leaves the cornea, or the lenses in front of it, towards the camera.
 
     The light is reflected at the surface of the given Purkinje image. Images 3 and 4 are seen through the pupil: their
     status is BEHIND_IRIS where the iris blocks the light on its way in or out.
@@ -72,6 +92,9 @@ def glint_exits(eye: EyeModel, order: int, lights_mm: Xyz, camera_mm: Xyz) -> tu
         return (nothing, nothing, nothing), nothing, status
     if order == 1:
         place = (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
+        if lenses:
+            legs = mirrored_legs(eye, lenses, lights_mm, place)
+            return legs.seen, legs.residual_mm, legs.status
         rays = mirrored_rays(eye.front[0], lights_mm, place, rim_mm=eye.limbus_radius_mm)
         return rays.exit, rays.residual_mm, rays.status
     corneal = len(eye.front)

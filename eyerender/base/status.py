@@ -32,6 +32,7 @@ class Status(IntEnum):
     NO_MIRROR_POINT = 6
     BEHIND_SCLERA = 7
     BEHIND_CAMERA = 8
+    AT_LENS_EDGE = 17
     # Fixations.
     TARGET_TOO_NEAR = 9
     OUT_OF_REACH = 10
@@ -75,6 +76,7 @@ _REASONS = {
     Status.NO_MIRROR_POINT: "no point of the surface mirrors the light to the viewpoint",
     Status.BEHIND_SCLERA: "behind the sclera",
     Status.BEHIND_CAMERA: "behind the camera",
+    Status.AT_LENS_EDGE: "at the edge of a lens",
     Status.TARGET_TOO_NEAR: "the target lies inside the eye",
     Status.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     Status.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",

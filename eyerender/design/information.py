@@ -68,6 +68,7 @@ def case_of(frames: Frames, rig: RigLike | None = None) -> tuple[Case, Ints]:
     """
     frames = frames.seen_by(rig)
     scene, index, pose = frames.scene, frames.index, frames.pose
+    scene.refuse_spectacles("information is computed")
     built, which = scene.eyes_of(index)
     eyes = stacked_eyes(built)
     keys = np.stack([index.head, index.fixation, index.eye], axis=-1)

@@ -13,9 +13,12 @@ import numpy as np
 from ..base.arrays import Indices, frozen
 from ..optics.transforms import stacked
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
+from .worn import WornLens
 
-Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str]
-_NUMBERS = tuple(f.name for f in fields(EyeModel) if f.name not in ("name", "side", "wavelength_nm", "back_passing"))
+Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str, tuple[WornLens, ...]]
+_NUMBERS = tuple(
+    f.name for f in fields(EyeModel) if f.name not in ("name", "side", "wavelength_nm", "back_passing", "worn")
+)
 _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
 CHUNK_POINTS = 30000
@@ -25,9 +28,9 @@ FEW_EYES = 4
 
 
 def structure_of(eye: EyeModel) -> Structure:
-    """Return the structure that eyes must share to be stacked: kinds and numbers of surfaces."""
+    """Return what eyes must share to be stacked: kinds and numbers of surfaces, and the lenses worn."""
     front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
-    return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind
+    return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind, eye.worn
 
 
 def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:

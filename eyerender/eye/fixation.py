@@ -11,30 +11,35 @@ six exit rays are extended backwards by one common length, chosen so that the me
 to the optic axis. That mean is the window's centre. The line of sight runs from the target towards it and must end on
 the fovea. (gkaModelEye's definition, Aguirre 2019, "A model of the entrance pupil of the human eye", Sci. Rep. 9,
 9360.)
+
+Behind spectacles the chief ray is traced on through the lenses, or past them outside their outlines; the pose is solved
+by Broyden's method. The lenses stay with the head, so here the course outside the eye does depend on the target.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import ArrayValue, Bools, Floats, Statuses, frozen
+from ..base.arrays import ArrayValue, Bools, Floats, Statuses, frozen, take_rows
 from ..base.errors import InputError
-from ..base.status import Status
+from ..base.status import Status, mark
 from ..optics.interface import dot
 from ..optics.solve import apparent_points
 from ..optics.surfaces import Xyz, components, join
 from ..optics.trace import trace
 from ..optics.transforms import inverse_2x2, normalize
-from .batch import CHUNK_POINTS, chunks, groups
+from .batch import CHUNK_POINTS, chunks, groups, take_eyes
 from .landmarks import path_to_retina
 from .model import EyeModel
 from .pose import Poses, Turning, centres_of, into_eye, rigid_motion, split
 from .pose_kernels import SETTLED_MM, turn_all
+from .worn import Course, choices, more_telling, reachable_by
 
 LineOfSightKind = Literal["chief_ray", "entrance_window"]
 
@@ -124,7 +129,7 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
     if target.ndim != 2 or target.shape[1] != 3 or not np.isfinite(target).all():
         raise InputError("must be finite points (x, y, z)", path="target_mm")
     if line_of_sight == "chief_ray":
-        return _by_chief_ray(eye, target)
+        return _by_chief_ray(eye, target) if not eye.worn else _through_lenses(eye, target)
     if line_of_sight == "entrance_window":
         return _by_entrance_window(eye, target)
     raise InputError(f"must be chief_ray or entrance_window, not {line_of_sight!r}", path="line_of_sight")
@@ -166,14 +171,82 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
     The error is the miss at the fovea, across the line of sight.
     """
     start = _by_chief_ray(eye, target_mm)
-    angles = np.stack([start.poses.azimuth_rad, start.poses.elevation_rad], axis=-1)
     ok = start.status == Status.OK
-    angles = np.where(ok[:, None], angles, 0.0)
-    miss, entry, way, lost = _window_miss(eye, target_mm, angles)
-    slope = np.stack(
-        [(_window_miss(eye, target_mm, angles + step)[0] - miss) / _NUDGE_RAD for step in _NUDGE_RAD * np.eye(2)],
-        axis=-1,
+    angles, missed = _solved(lambda angles: _window_miss(eye, target_mm, angles), start.poses, ok)
+    azimuth, elevation = angles.T
+    residual = np.linalg.norm(missed.miss, axis=-1)
+    status = np.where(
+        ok, _status(target_mm, azimuth=azimuth, elevation=elevation, residual=residual), start.status
+    ).astype(np.int8)
+    status[ok & missed.lost] = Status.NO_LINE_OF_SIGHT
+    return Fixations(
+        poses=Poses.listing(azimuth, elevation),
+        residual_mm=residual,
+        status=status,
+        line_of_sight_mm=missed.point,
+        line_of_sight_direction=missed.way,
     )
+
+
+def _through_lenses(eye: EyeModel, target_mm: Floats) -> Fixations:
+    """Turn the chief ray, traced on through the lenses or past them, through the target."""
+    bare = _by_chief_ray(eye, target_mm)
+    angles = np.stack([bare.poses.azimuth_rad, bare.poses.elevation_rad], axis=-1)
+    residual, status = np.array(bare.residual_mm), np.full(len(target_mm), Status.NONE, dtype=np.int8)
+    for choice in choices(len(eye.worn)):
+        course = Course.of(eye.worn, (), (), choice)
+        rows = np.flatnonzero((status != Status.OK) & reachable_by(eye.worn, choice, components(target_mm)))
+        if not len(rows):
+            continue
+        one, target, poses = take_eyes(eye, rows), target_mm[rows], take_rows(bare.poses, rows)
+        ok = bare.status[rows] == Status.OK
+        found, missed = _solved(partial(_lens_miss, course, one, target), poses, ok)
+        miss = np.linalg.norm(missed.miss, axis=-1)
+        traced, passes = course.follow(components(missed.point), components(missed.way), components(target))
+        new = _status(target, azimuth=found[:, 0], elevation=found[:, 1], residual=miss)
+        behind = np.sum((target - traced.points_mm[-1]) * traced.directions[-1], axis=-1) <= 0.0
+        mark(new, behind, Status.TARGET_TOO_NEAR)
+        new = np.where(new == Status.OK, passes, new)
+        new = np.where(ok, new, bare.status[rows])
+        angles[rows], residual[rows], status[rows] = found, miss, more_telling(status[rows], new)
+    return Fixations(
+        poses=Poses.listing(angles[:, 0], angles[:, 1]),
+        residual_mm=residual,
+        status=status,
+        line_of_sight_mm=bare.line_of_sight_mm,
+        line_of_sight_direction=bare.line_of_sight_direction,
+    )
+
+
+def _lens_miss(course: Course, eye: EyeModel, target_mm: Floats, angles: Floats) -> _Missed:
+    """Compute the miss (n, 2) of targets by the chief ray behind lenses, and where it is in the unturned frame."""
+    turn, shift = rigid_motion(Poses.listing(angles[:, 0], angles[:, 1]), eye)
+    point = np.einsum("nij,nj->ni", turn, np.broadcast_to(eye.chief_ray.point_mm, target_mm.shape)) + shift
+    way = np.einsum("nij,nj->ni", turn, np.broadcast_to(eye.chief_ray.direction, target_mm.shape))
+    traced = trace(course.path, 1.0, point, way)
+    lost = traced.status != Status.OK
+    first, second = _tangents(split(traced.directions[-1]))
+    gap = split(target_mm - traced.points_mm[-1])
+    miss = np.stack([dot(first, gap), dot(second, gap)], axis=-1)
+    return _Missed(np.where(lost[:, None], 0.0, miss), point, way, lost)
+
+
+class _Missed(NamedTuple):
+    """A line of sight of a pose: its miss (n, 2) mm, a point and a direction of it (n, 3), and where there is none."""
+
+    miss: Floats
+    point: Floats
+    way: Floats
+    lost: Bools
+
+
+def _solved(miss_at: Callable[[Floats], _Missed], start: Poses, ok: Bools) -> tuple[Floats, _Missed]:
+    """Solve for the azimuths and elevations (n, 2) at which nothing is missed, by Broyden's method."""
+    angles = np.stack([start.azimuth_rad, start.elevation_rad], axis=-1)
+    angles = np.where(ok[:, None], angles, 0.0)
+    now = miss_at(angles)
+    miss, lost = now.miss, now.lost
+    slope = np.stack([(miss_at(angles + step).miss - miss) / _NUDGE_RAD for step in _NUDGE_RAD * np.eye(2)], axis=-1)
     for _ in range(_STEPS):
         if not np.max(np.abs(miss), where=(ok & ~lost)[:, None], initial=0.0) > SETTLED_MM:
             break
@@ -182,28 +255,18 @@ def _by_entrance_window(eye: EyeModel, target_mm: Floats) -> Fixations:
         step = -np.einsum("nij,nj->ni", inverse_2x2(safe), np.where(sound[:, None], miss, 0.0))
         step = np.clip(step, -0.2, 0.2)
         angles = angles + step
-        new, entry, way, lost = _window_miss(eye, target_mm, angles)
+        now = miss_at(angles)
+        new, lost = now.miss, now.lost
         square = np.maximum(np.sum(step * step, -1), 1e-300)
         surprise = new - miss - np.einsum("nij,nj->ni", slope, step)
         # Tiny steps consist of rounding errors and would spoil the slope.
         learn = (square > 1e-22)[:, None, None]
         slope = slope + np.where(learn, surprise[:, :, None] * step[:, None, :] / square[:, None, None], 0.0)
         miss = new
-    residual = np.linalg.norm(miss, axis=-1)
-    status = np.where(
-        ok, _status(target_mm, azimuth=angles[:, 0], elevation=angles[:, 1], residual=residual), start.status
-    ).astype(np.int8)
-    status[ok & lost] = Status.NO_LINE_OF_SIGHT
-    return Fixations(
-        poses=Poses.listing(angles[:, 0], angles[:, 1]),
-        residual_mm=residual,
-        status=status,
-        line_of_sight_mm=entry,
-        line_of_sight_direction=way,
-    )
+    return angles, now
 
 
-def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floats, Floats, Floats, Bools]:
+def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> _Missed:
     """Compute the miss at the fovea (n, 2), point on the cornea, direction to the target, and where no ray exists."""
     poses = Poses.listing(angles[:, 0], angles[:, 1])
     seen = join(into_eye(Turning.of(poses), eye, components(target_mm)))
@@ -214,7 +277,7 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> tuple[Floa
     first, second = _tangents(split(eye.chief_ray.direction))
     gap = traced.points_mm[-1] - eye.fovea_mm
     miss = np.stack([dot(first, split(gap)), dot(second, split(gap))], axis=-1)
-    return np.where(lost[:, None], 0.0, miss), traced.points_mm[1], -direction, lost
+    return _Missed(np.where(lost[:, None], 0.0, miss), traced.points_mm[1], -direction, lost)
 
 
 def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Bools]:

@@ -14,6 +14,7 @@ from ..optics.gradient import GradientMedium
 from ..optics.shells import SHELLS, even_layers, lens_shells, passing_shells
 from ..optics.surfaces import Surface, Xyz, components, fit, shift, turn_back
 from ..optics.transforms import flip_y, mirror_rotation
+from .worn import WornLens
 
 __all__ = ["EyeModel", "LineOfSight", "RotationCentres", "Side", "Sphere", "Stop"]
 
@@ -173,6 +174,7 @@ class EyeModel(ArrayValue):
         fovea_mm: (3,) position of the fovea.
         chief_ray: the fixed ray in air that reaches the fovea through the stop's centre.
         lens_gradient: medium of a gradient lens; None without one, or if it is made of shells.
+        worn: spectacle lenses in front of the eye, in order from it, in the frame of the unrotated eye.
     """
 
     name: str
@@ -193,6 +195,7 @@ class EyeModel(ArrayValue):
     fovea_mm: Floats
     chief_ray: LineOfSight
     lens_gradient: GradientMedium | None = None
+    worn: tuple[WornLens, ...] = ()
 
     @property
     def purkinje_orders(self) -> tuple[int, ...]:

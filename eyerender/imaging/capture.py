@@ -275,6 +275,7 @@ def check_windows(scene: RenderableScene) -> None:
     Raises:
         InputError: they cannot.
     """
+    scene.refuse_spectacles("pictures are rendered")
     spp = scene.spec.image.spp
     for i in range(len(scene.rig.cameras)):
         width, height = scene.window_size_px(i)

@@ -51,6 +51,7 @@ def render_folder(
     """
     warnings = scene.warnings()
     refuse_non_empty(path, overwrite)  # before the work, not after it
+    check_windows(scene)
     frames = scene.frames()
     truth = trace(frames)
     records = list(truth.records())

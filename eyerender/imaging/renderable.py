@@ -89,6 +89,10 @@ class RenderableScene(TraceableScene, Protocol):
         """Accommodation, D; None if the eye is focused on its target."""
         ...
 
+    def refuse_spectacles(self, what: str) -> None:
+        """Raise an error where spectacles are worn."""
+        ...
+
     def eye(self, side: str) -> EyeModel:
         """Return the numeric eye of a side."""
         ...

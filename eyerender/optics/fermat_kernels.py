@@ -153,19 +153,19 @@ def evaluate(surfaces: Surfaces, j: int, batch: Batch, nodes: Nodes) -> None:
 
 
 @merged
-def paraxial_start(surfaces: Surfaces, batch: Batch, nodes: Nodes) -> None:
+def paraxial_start(surfaces: Surfaces, rimmed: int, batch: Batch, nodes: Nodes) -> None:
     """Guess the start (y, z) on each surface by paraxial optics.
 
-    On the outermost surface the guess is the straight line's point, moved by m = 1 / (1 - d (n - 1) / (n R)) away from
-    the line through the viewpoint and the centre of curvature, which is not refracted; d is the object's depth, n its
-    index. On the other surfaces it is on the straight line from there to the object.
+    On the rimmed surface (the cornea) the guess is the straight line's point, moved by m = 1 / (1 - d (n - 1) / (n R))
+    away from the line through the viewpoint and the centre of curvature, which is not refracted; d is the object's
+    depth, n its index. On the other surfaces it is on the straight lines from there to the object and to the viewpoint.
     """
     last = len(nodes) - 1
-    start, seen, end = nodes[1], nodes[0], nodes[last]
+    start, seen, end = nodes[rimmed], nodes[0], nodes[last]
     for lane in range(LANES):
         start.y[lane], start.z[lane] = 0.0, 0.0
     for turn in range(3):
-        for j in range(1, 2):
+        for j in range(rimmed, rimmed + 1):
             evaluate(surfaces, j, batch, nodes)
         if turn == 0:
             for lane in range(LANES):
@@ -188,8 +188,18 @@ def paraxial_start(surfaces: Surfaces, batch: Batch, nodes: Nodes) -> None:
             start.y[lane] = far * seen.y[lane] + near * end.y[lane]
             start.z[lane] = far * seen.z[lane] + near * end.z[lane]
             start.x[lane] = x
-    for j in range(2, last):
-        node = nodes[j]
+    straight_start(surfaces, rimmed, batch, nodes)
+
+
+@merged
+def straight_start(surfaces: Surfaces, rimmed: int, batch: Batch, nodes: Nodes) -> None:
+    """Guess (y, z) on all other surfaces, on the straight lines from the guess on the rimmed one to both ends."""
+    last = len(nodes) - 1
+    start = nodes[rimmed]
+    for j in range(1, last):
+        if j == rimmed:
+            continue
+        node, end = nodes[j], nodes[last if j > rimmed else 0]
         for lane in range(LANES):
             node.y[lane], node.z[lane] = start.y[lane], start.z[lane]
         evaluate(surfaces, j, batch, nodes)
@@ -282,14 +292,14 @@ def step(node: Node, following: Node, innermost: bool) -> int:
 
 
 @merged
-def solve(surfaces: Surfaces, batch: Batch, nodes: Nodes) -> None:
+def solve(surfaces: Surfaces, steps: int, batch: Batch, nodes: Nodes) -> None:
     """Run Newton on all surfaces: eliminate the block-tridiagonal system inwards and solve it outwards."""
     last = len(nodes) - 1
     moving = LANES
-    for turn in range(STEPS + 1):
+    for turn in range(steps + 1):
         for j in range(1, last):
             evaluate(surfaces, j, batch, nodes)
-        if turn == STEPS or (turn > 1 and moving == 0):
+        if turn == steps or (turn > 1 and moving == 0):
             break
         for j in range(last):
             aim(nodes[j], nodes[j + 1])
@@ -305,8 +315,8 @@ def solve(surfaces: Surfaces, batch: Batch, nodes: Nodes) -> None:
 
 
 @inlined
-def bend(before: Node, node: Node, reflects: bool) -> None:
-    """Refract or reflect the traced ray on a node, if it comes from the front and passes."""
+def bend(before: Node, node: Node, reflects: bool, sign: float) -> None:
+    """Refract or reflect the traced ray on a node, if it comes from the front (the back for a sign -1) and passes."""
     for lane in range(LANES):
         hy, hz = node.slope_y[lane], node.slope_z[lane]
         scale = 1.0 / np.sqrt(1.0 + hy * hy + hz * hz)
@@ -315,15 +325,15 @@ def bend(before: Node, node: Node, reflects: bool) -> None:
         if reflects:
             mirrored = _reflect(way, normal)
             node.w_x[lane], node.w_y[lane], node.w_z[lane] = mirrored.way
-            node.alive[lane] = before.alive[lane] if mirrored.cosine > 0.0 else 0.0
+            node.alive[lane] = before.alive[lane] if sign * mirrored.cosine > 0.0 else 0.0
         else:
             bent = _refract(way, normal, before.index[lane] / node.index[lane], 0.0)
             node.w_x[lane], node.w_y[lane], node.w_z[lane] = bent.way
-            node.alive[lane] = before.alive[lane] if bent.cosine > 0.0 and bent.passes else 0.0
+            node.alive[lane] = before.alive[lane] if sign * bent.cosine > 0.0 and bent.passes else 0.0
 
 
 @merged
-def trace(surfaces: Surfaces, reflects: bool, batch: Batch, nodes: Nodes) -> None:
+def trace(surfaces: Surfaces, reflects: bool, rimmed: int, batch: Batch, nodes: Nodes) -> None:
     """Trace the ray that leaves the viewpoint for the outermost surface through all others.
 
     Each hit is solved by Newton's method from the path's point.
@@ -338,7 +348,7 @@ def trace(surfaces: Surfaces, reflects: bool, batch: Batch, nodes: Nodes) -> Non
     for j in range(1, len(nodes) - 1):
         if j > 1:
             meet(surfaces, j, batch, nodes)
-        bend(nodes[j - 1], nodes[j], reflects)
+        bend(nodes[j - 1], nodes[j], reflects and j == rimmed, -1.0 if reflects and j > rimmed else 1.0)
         node = nodes[j]
         for lane in range(LANES):
             if not abs(node.p_x[lane] - node.x[lane]) < SURE_MM:
@@ -378,12 +388,12 @@ def axis_distance(sheet: Sheet, x: float, y: float, z: float) -> float:
 
 @merged
 def store(
-    sheets: Sheets, rims: Floats, reflects: bool, batch: Batch, nodes: Nodes,
+    sheets: Sheets, rims: Floats, reflects: bool, rimmed: int, batch: Batch, nodes: Nodes,
     exits: Floats, ways: Floats, ends: Floats, residuals: Floats, state: Statuses,
 ) -> None:  # fmt: skip
     """Write the rays and their statuses, from the miss of the traced ray at its target."""
     last = len(nodes) - 1
-    seen, front, inner, goal = nodes[0], nodes[1], nodes[last - 1], nodes[last]
+    seen, front, inner, goal, edge = nodes[0], nodes[1], nodes[last - 1], nodes[last], nodes[rimmed]
     for lane in range(min(LANES, batch.total - batch.first)):
         i, k = row_of(batch, lane)
         exits[0, i, k], exits[1, i, k], exits[2, i, k] = front.x[lane], front.y[lane], front.z[lane]
@@ -400,9 +410,9 @@ def store(
             # A distant source magnifies Newton's remaining error of the mirror point.
             reach = min(SURE_MM + 1e-15 * along * along, RESIDUAL_LIMIT_MM)
         residuals[i, k] = residual
-        sheet, rim = sheets[min(i, len(sheets) - 1), 0], rims[min(i, len(rims) - 1)]
+        sheet, rim = sheets[min(i, len(sheets) - 1), rimmed - 1], rims[min(i, len(rims) - 1)]
         if inner.alive[lane] > 0.0 and residual <= reach and along > 0.0:
-            beyond = axis_distance(sheet, front.x[lane], front.y[lane], front.z[lane]) > rim
+            beyond = axis_distance(sheet, edge.x[lane], edge.y[lane], edge.z[lane]) > rim
             state[i, k] = OUTSIDE if beyond else FOUND
         elif state[i, k] != OUTSIDE:
             state[i, k] = LOST
@@ -410,7 +420,7 @@ def store(
 
 @merged
 def mirror_start(
-    surfaces: Surfaces, rims: Floats, batch: Batch, nodes: Nodes, guesses: Floats, state: Statuses
+    surfaces: Surfaces, rims: Floats, rimmed: int, batch: Batch, nodes: Nodes, guesses: Floats, state: Statuses
 ) -> None:
     """Guess mirror points: where the bisectors through the centre of curvature of the apex meet the surface.
 
@@ -418,15 +428,15 @@ def mirror_start(
     outside the rim, or its bisector does not point to the front, because then the surface has no mirror point.
     """
     last = len(nodes) - 1
-    seen, w, goal, sheets = nodes[0], nodes[1], nodes[last], surfaces.sheets
+    seen, w, goal, sheets = nodes[0], nodes[rimmed], nodes[last], surfaces.sheets
     for lane in range(LANES):
-        apex = sheets[min(row_of(batch, lane)[0], len(sheets) - 1), 0].apex
+        apex = sheets[min(row_of(batch, lane)[0], len(sheets) - 1), rimmed - 1].apex
         w.y[lane], w.z[lane] = apex[0], apex[1]
-    for j in range(1, last):
+    for j in range(rimmed, rimmed + 1):
         evaluate(surfaces, j, batch, nodes)
     for lane in range(LANES):
         i, k = row_of(batch, lane)
-        sheet, rim = sheets[min(i, len(sheets) - 1), 0], rims[min(i, len(rims) - 1)]
+        sheet, rim = sheets[min(i, len(sheets) - 1), rimmed - 1], rims[min(i, len(rims) - 1)]
         hy, hz = w.slope_y[lane], w.slope_z[lane]
         size = np.sqrt(1.0 + hy * hy + hz * hz)
         nx, ny, nz = 1.0 / size, -hy / size, -hz / size
@@ -443,11 +453,13 @@ def mirror_start(
         guesses[0, i, k], guesses[1, i, k], guesses[2, i, k] = x, y, z
         away = not ax * nx + ay * ny + az * nz > 0.0 or axis_distance(sheet, x, y, z) > 1.25 * rim
         state[i, k] = OUTSIDE if rim < np.inf and away else LOST
+        w.x[lane] = x
+    straight_start(surfaces, rimmed, batch, nodes)
 
 
 @compiled(
-    "i8[::1], SHEET[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], b1, f8[:,:,::1], f8[:,:,::1], "
-    "f8[:,:,::1], f8[:,:,::1], f8[:,::1], i1[:,::1]",
+    "i8[::1], SHEET[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], b1, i8, f8[:,:,::1], "
+    "f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i1[:,::1]",
     SHEET=SHEET,
 )
 def connect_all(
@@ -459,6 +471,7 @@ def connect_all(
     viewpoint: Floats,
     target: Floats,
     reflects: bool,
+    rimmed: int,
     guesses: Floats,
     exits: Floats,
     ways: Floats,
@@ -466,7 +479,7 @@ def connect_all(
     residuals: Floats,
     state: Statuses,
 ) -> None:
-    """Solve for the rays from viewpoints to targets, through all surfaces or reflected by one of them outside.
+    """Solve for the rays from viewpoints to targets, through all surfaces; the rimmed one may reflect them instead.
 
     Every path is traced from the viewpoint; a ray that misses the target by more than rounding is LOST.
 
@@ -475,10 +488,11 @@ def connect_all(
         sheets: (1 or n, s) surfaces.
         table: table of the surfaces.
         ladder: (1 or n, s + 1) index in front of the first surface, then that behind each.
-        rims: (1 or n,) radius at which the outermost surface ends.
+        rims: (1 or n,) radius at which the rimmed surface ends.
         viewpoint: (3, 1 or n, 1 or m) mm.
         target: (3, 1 or n, 1 or m) mm.
-        reflects: whether the only surface reflects the rays.
+        reflects: whether the rimmed surface reflects the rays; those behind it in the list are crossed on the way out.
+        rimmed: number of the surface with a rim, from 1: the outermost one of the eye.
         guesses: (3, n, m) first guesses of mirror points, written if it reflects.
         exits: (3, n, m) points on the outermost surface, written.
         ways: (3, n, m) directions to them from the viewpoint, written.
@@ -491,9 +505,9 @@ def connect_all(
         batch = Batch(first, state.size, max(state.shape[1], 1))
         load(surfaces, ladder, viewpoint, target, batch, nodes)
         if reflects:
-            mirror_start(surfaces, rims, batch, nodes, guesses, state)
+            mirror_start(surfaces, rims, rimmed, batch, nodes, guesses, state)
         else:
-            paraxial_start(surfaces, batch, nodes)
-        solve(surfaces, batch, nodes)
-        trace(surfaces, reflects, batch, nodes)
-        store(sheets, rims, reflects, batch, nodes, exits, ways, ends, residuals, state)
+            paraxial_start(surfaces, rimmed, batch, nodes)
+        solve(surfaces, STEPS if rimmed == 1 else 2 * STEPS, batch, nodes)
+        trace(surfaces, reflects, rimmed, batch, nodes)
+        store(sheets, rims, reflects, rimmed, batch, nodes, exits, ways, ends, residuals, state)

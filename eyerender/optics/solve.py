@@ -22,7 +22,7 @@ from .fermat_kernels import LOST, connect_all
 from .graphs import graphs_of
 from .sheets import Graphs
 from .shooting import Shot, connect, taken
-from .surfaces import Surface, Xyz, components, join, shift, turn, turn_back
+from .surfaces import Surface, Xyz, components, fit, join, shift, turn, turn_back
 from .trace import Crossing, each, outward_path, trace
 
 
@@ -104,19 +104,22 @@ def refracted_rays(
     n_outside: float = 1.0,
 ) -> Rays:
     """Compute `apparent_points` on components."""
-    path = [
+    return joined_rays(refracting_path(surfaces, indices, rim_mm), n_outside, viewpoint, target)
+
+
+def refracting_path(
+    surfaces: Sequence[Surface], indices: Sequence[FloatLike], rim_mm: FloatLike = np.inf
+) -> tuple[Crossing, ...]:
+    """Return the refractions at surfaces, outside in, of which the outermost one ends at the limbus."""
+    return tuple(
         Crossing(surface=surface, n_after=index, rim_mm=rim_mm if k == 0 else np.inf, beyond_rim=Status.OUTSIDE_LIMBUS)
         for k, (surface, index) in enumerate(zip(surfaces, indices, strict=True))
-    ]
-    graphs = graphs_of(*surfaces)
-    if graphs is None:
-        rays = _from_connection(connect(path, n_outside, viewpoint, target, target))
-    else:
-        ladder = np.stack(np.broadcast_arrays(*(np.atleast_1d(n) for n in (n_outside, *indices))), axis=-1)
-        rays, found, _ = _joined(graphs, ladder, rim_mm, viewpoint, target)
-        if not found.all():
-            rays = _searched(path, n_outside, viewpoint, target, target, rays, ~found)
-    return _launched(path, n_outside, viewpoint, target, rays)
+    )
+
+
+def mirroring(surface: Surface, rim_mm: FloatLike = np.inf) -> Crossing:
+    """Return the reflection at the cornea, which ends at the limbus."""
+    return Crossing(surface=surface, n_after=1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS)
 
 
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
@@ -130,16 +133,37 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
         viewpoint: components of the viewpoints; they broadcast against the sources.
         rim_mm: rim radius of the surface (the limbus).
     """
-    path = (Crossing(surface=surface, n_after=1.0, reflects=True, rim_mm=rim_mm, beyond_rim=Status.OUTSIDE_LIMBUS),)
-    graphs = graphs_of(surface)
+    return joined_rays((mirroring(surface, rim_mm),), 1.0, viewpoint, source)
+
+
+def joined_rays(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rimmed: int = 0) -> Rays:
+    """Solve for the rays from viewpoints through a path to targets: refracted ones, or those that a surface reflects.
+
+    Args:
+        path: the crossings, in order from the viewpoint. One of them may reflect: `rimmed`.
+        n_outside: index at the viewpoint.
+        viewpoint: components of the viewpoints.
+        target: components of the targets; both broadcast.
+        rimmed: number of the crossing whose rim counts, the outermost one of the eye. Surfaces in front of it (lenses
+            of spectacles) have none here.
+    """
+    edge, graphs = path[rimmed], graphs_of(*(crossing.surface for crossing in path))
     if graphs is None:
-        return _from_connection(connect(path, 1.0, viewpoint, source, components(apex_of(surface))))
-    rays, found, guess = _joined(graphs, np.ones((1, 2)), rim_mm, viewpoint, source, reflects=True)
-    return rays if found.all() else _searched(path, 1.0, viewpoint, source, guess, rays, ~found)
+        ndim = max(viewpoint[0].ndim, target[0].ndim)
+        aim = each(lambda axis: np.asarray(fit(axis, ndim)), components(apex_of(edge.surface)))
+        rays = _from_connection(connect(path, n_outside, viewpoint, target, aim if edge.reflects else target))
+    else:
+        media = (n_outside, *(crossing.n_after for crossing in path))
+        ladder = np.stack(np.broadcast_arrays(*(np.atleast_1d(n) for n in media)), axis=-1)
+        rays, found, guess = _joined(graphs, ladder, edge.rim_mm, viewpoint, target, edge.reflects, rimmed)
+        if not found.all():
+            aim = guess if edge.reflects else target
+            rays = _searched(path, n_outside, viewpoint, target, aim, rays, ~found)
+    return rays if edge.reflects else _launched(path, n_outside, viewpoint, target, rays)
 
 
 def _joined(
-    graphs: Graphs, ladder: Floats, rim_mm: FloatLike, viewpoint: Xyz, target: Xyz, *, reflects: bool = False
+    graphs: Graphs, ladder: Floats, rim_mm: FloatLike, viewpoint: Xyz, target: Xyz, reflects: bool, rimmed: int
 ) -> tuple[Rays, Bools, Xyz]:
     """Run the compiled solver; return its rays, which of them converged, and the first guesses of mirror points."""
     shape = np.broadcast_shapes(*(p.shape for p in (*viewpoint, *target)))
@@ -149,11 +173,11 @@ def _joined(
     state = np.full((full[0], int(np.prod(full[1:], dtype=np.intp))), LOST, dtype=np.int8)
     found, residual = np.empty((4, 3, *state.shape)), np.empty(state.shape)
     rims = np.array(np.atleast_1d(rim_mm), dtype=np.float64)
-    ends = _rows(viewpoint, full), _rows(target, full)
     kinds, sheets, table = graphs.kinds, graphs.sheets, graphs.table
     connect_all(
-        kinds, sheets, table, ladder, rims, *ends, reflects, found[0], found[1], found[2], found[3], residual, state
-    )
+        kinds, sheets, table, ladder, rims, _rows(viewpoint, full), _rows(target, full), reflects, rimmed + 1,
+        found[0], found[1], found[2], found[3], residual, state,
+    )  # fmt: skip
     guess, exits, way, end = ((x, y, z) for x, y, z in found.reshape(4, 3, *shape))
     if not graphs.plain:
         exits, guess = (shift(turn(graphs.rotation, p), graphs.origin_mm, 1.0) for p in (exits, guess))

@@ -125,6 +125,15 @@ class Surface(ABC):
         """Move the surface to another origin and rotation."""
         return replace(self, origin_mm=origin_mm, rotation=rotation)  # type: ignore[type-var]
 
+    def seen_from(self, origin_mm: Floats, rotation: Floats) -> Self:
+        """Express the surface in another frame p', or in one per eye (n, ...), where p = rotation p' + origin_mm."""
+        back = np.swapaxes(rotation, -1, -2)
+        moved = (back @ (self.origin_mm - origin_mm)[..., None])[..., 0]
+        shape, own = moved.shape[:-1], len(self.batch_shape)
+        rest = [np.broadcast_to(part, (*shape, *np.shape(part)[own:])) for part in self._parts()[2:]]
+        parts: tuple[Floats, ...] = (moved, back @ self.rotation, *rest)
+        return type(self)(*parts)
+
     def scaled(self, centre_mm: Floats, factor: float) -> Self:
         """Multiply all distances from `centre_mm` (3,) by `factor` > 0."""
         origin = centre_mm + factor * (self.origin_mm - centre_mm)

@@ -141,12 +141,6 @@ class Quadric(Surface):
         """Return (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame; numbers or (n,) arrays."""
         return self._eye
 
-    def seen_from(self, origin_mm: Floats, rotation: Floats) -> Quadric:
-        """Express the surface in another frame p', where p = rotation p' + origin_mm."""
-        back = np.swapaxes(rotation, -1, -2)
-        moved = (back @ (self.origin_mm - origin_mm)[..., None])[..., 0]
-        return Quadric(moved, back @ self.rotation, self.matrix, self.vector, self.constant)
-
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
         """Solve (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 for the required sign of d.g, as F / (-b -+ sqrt(b^2 - aF))."""
         ox, oy, oz = origin

@@ -24,6 +24,7 @@ def scene_view(scene: Scene) -> Any:
     For the first fixation of the first head position it adds the lines of sight, and the rays of glint and pupil centre
     to each camera.
     """
+    scene.refuse_spectacles("scenes are drawn")
     with figure(9.5, 7.5, 1) as (fig, flat):
         flat.remove()
         ax = fig.add_subplot(projection="3d")

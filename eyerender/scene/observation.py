@@ -28,9 +28,9 @@ RECORD_SCHEMA = "eyerender/record/3"
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
 # Largest number of glints of all observations of a batch; each has a status and a reason.
 MAX_GLINTS = 5_000_000
-# Keys of a record that no scene fills yet: motion of rig and eye, reflections beside the glints.
+# Keys of a record that no scene fills yet: motion of rig and eye, further reflections.
 _UNUSED = ("rig_pose", "events", "blink_phase")
-_UNUSED_FEATURES = ("lens_glints", "ghost_glints", "purkinje")
+_UNUSED_FEATURES = ("ghost_glints", "purkinje")
 # Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
@@ -162,6 +162,18 @@ class GlintFeatures(Columns):
         return np.where(found[:, None], xy, np.nan), found
 
 
+SURFACES = ("front", "back")
+"""Surfaces of a lens that mirror lamps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LensGlintFeatures(GlintFeatures):
+    """Reflections of lamps in the lenses worn, as glints with `surface` (0 front, 1 back) and `index` of the image."""
+
+    surface: Ints = column()
+    index: Ints = column()
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Observations(ArrayValue):
     """A batch of observations, in frame order and with the right eye first within a frame.
@@ -175,13 +187,16 @@ class Observations(ArrayValue):
     pose: PoseTruth
     pupil: PupilFeatures
     glints: GlintFeatures
+    lens_glints: LensGlintFeatures | None = None
 
     def __len__(self) -> int:
         return len(self.index)
 
     def take(self, rows: Any) -> Observations:
         """Select rows (indices, a slice or a mask)."""
-        return Observations(**{part.name: getattr(self, part.name).take(rows) for part in fields(self)})
+        parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
+        parts = {name: part if part is None else part.take(rows) for name, part in parts.items()}
+        return Observations(**parts)
 
     def with_targets(self, target_mm: ArrayLike) -> Observations:
         """Replace the targets by points (n, 3) or (3,) mm in the world, NaN where there is none."""
@@ -194,9 +209,9 @@ class Observations(ArrayValue):
             yield self._record(i)
 
     def _record(self, i: int) -> dict[str, Any]:
-        at, pose, pupil, glints = self.index, self.pose, self.pupil, self.glints
-        # Plain integers: comparing a NumPy integer with a Status takes 20 times as long.
-        status, glint_status = Status(int(pupil.status[i])), list(map(Status, glints.status[i].tolist()))
+        at, pose, pupil, lens_glints = self.index, self.pose, self.pupil, self.lens_glints
+        # A plain integer: comparing a NumPy integer with a Status takes 20 times as long.
+        status = Status(int(pupil.status[i]))
         return {
             "schema": RECORD_SCHEMA,
             "frame": int(at.frame[i]),
@@ -231,19 +246,8 @@ class Observations(ArrayValue):
                 "arc_ellipse": _arc_ellipse(pupil.arc_ellipse[i]),
                 "time_s": None,
             },
-            "glints": [
-                {
-                    "light": _count(glints.light[i, j]),
-                    "status": glint_status[j].label,
-                    "reason": glints.reason[i, j] or None,
-                    "in_image": bool(glints.in_image[i, j]) if glint_status[j] == Status.OK else None,
-                    "xy_px": _numbers(glints.xy_px[i, j]),
-                    "covariance": _numbers(glints.covariance[i, j]),
-                    "time_s": None,
-                }
-                for j in range(len(glint_status))
-                if glint_status[j] != Status.NONE
-            ],
+            "glints": _glint_records(self.glints, i),
+            "lens_glints": None if lens_glints is None else _glint_records(lens_glints, i) or None,
             **dict.fromkeys(_UNUSED_FEATURES),
             # Only extractors have one; records of ray optics do not have the key.
             **({} if np.isnan(pupil.confidence[i]) else {"confidence": float(pupil.confidence[i])}),
@@ -319,7 +323,8 @@ class Observations(ArrayValue):
                 arc_ellipse=reader.arc_ellipses(),
                 confidence=reader.array("confidence", (), optional=True),
             ),
-            glints=reader.glints(),
+            glints=GlintFeatures(**reader.glints("glints")),
+            lens_glints=reader.lens_glints(),
         )
         for key in (*_UNUSED, *_UNUSED_FEATURES, "pupil.time_s"):
             reader.values(key)
@@ -458,11 +463,26 @@ class _Reader:
                 self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
         return frozen(out)
 
-    def glints(self) -> GlintFeatures:
-        rows = [[] if entries is None and not self.complete else entries for entries in self.values("glints")]
+    def lens_glints(self) -> LensGlintFeatures | None:
+        if all(entries is None for entries in self.values("lens_glints")):
+            return None
+        found = self.glints("lens_glints")
+        surface, index = (np.full(found["light"].shape, -1, np.int64) for _ in range(2))
+        for k, record in enumerate(self.records):
+            for j, one in enumerate(record.get("lens_glints") or ()):
+                name, number = (one.get("surface"), one.get("index")) if isinstance(one, dict) else (None, None)
+                if name not in SURFACES or not _is_count(number):
+                    self.refuse(k, f"lens_glints.{j}", "needs surface, front or back, and index, a whole number")
+                else:
+                    surface[k, j], index[k, j] = SURFACES.index(name), number
+        return LensGlintFeatures(**found, surface=surface, index=index)
+
+    def glints(self, key: str) -> dict[str, Any]:
+        absent = not self.complete or key != "glints"
+        rows = [[] if entries is None and absent else entries for entries in self.values(key)]
         for k, entries in enumerate(rows):
             if not isinstance(entries, list) or len(entries) > _MAX_ENTRIES:
-                self.refuse(k, "glints", f"must be a list of at most {_MAX_ENTRIES}")
+                self.refuse(k, key, f"must be a list of at most {_MAX_ENTRIES}")
                 rows[k] = []
         n, m = len(rows), max(map(len, rows), default=0)
         _check_width(n, m, MAX_GLINTS, "glints", self.problems.source)
@@ -477,7 +497,7 @@ class _Reader:
                         g["status"] = "missing" if g["xy_px"] is None else "ok"
                 why = _glint_problem(g)
                 if why is not None:
-                    self.refuse(k, f"glints.{j}", f"is no glint record: {why}")
+                    self.refuse(k, f"{key}.{j}", f"is no glint record: {why}")
                     continue
                 light[k, j] = -1 if g["light"] is None else g["light"]
                 status[k, j] = int(Status.of_record(g["status"], g["reason"]))
@@ -486,9 +506,31 @@ class _Reader:
                     xy[k, j] = g["xy_px"]
                 if g["covariance"] is not None:
                     covariance[k, j] = g["covariance"]
-        return GlintFeatures(
-            light=light, status=status, reason=reason, in_image=inside, xy_px=xy, covariance=covariance
-        )
+        return {
+            "light": light, "status": status, "reason": reason,
+            "in_image": inside, "xy_px": xy, "covariance": covariance,
+        }  # fmt: skip
+
+
+def _glint_records(glints: GlintFeatures, i: int) -> list[dict[str, Any]]:
+    """Write the glints of row i, with surface and index where a lens shows them."""
+    # Plain integers: comparing a NumPy integer with a Status takes 20 times as long.
+    status = list(map(Status, glints.status[i].tolist()))
+    lens = glints if isinstance(glints, LensGlintFeatures) else None
+    return [
+        {
+            "light": _count(glints.light[i, j]),
+            **({} if lens is None else {"surface": SURFACES[lens.surface[i, j]], "index": int(lens.index[i, j])}),
+            "status": status[j].label,
+            "reason": glints.reason[i, j] or None,
+            "in_image": bool(glints.in_image[i, j]) if status[j] == Status.OK else None,
+            "xy_px": _numbers(glints.xy_px[i, j]),
+            "covariance": _numbers(glints.covariance[i, j]),
+            "time_s": None,
+        }
+        for j in range(len(status))
+        if status[j] != Status.NONE
+    ]
 
 
 def _arc_ellipse(values: Floats) -> dict[str, Any] | None:
@@ -573,7 +615,15 @@ def concatenate(parts: Iterable[Observations]) -> Observations:
             columns[f.name] = np.concatenate([_widened(a, width) for a in arrays])
         return replace(groups[0], **columns)
 
-    return Observations(index=joined("index"), pose=joined("pose"), pupil=joined("pupil"), glints=joined("glints"))
+    joint: dict[str, Any] = {name: joined(name) for name in ("index", "pose", "pupil", "glints")}
+    if any(b.lens_glints is not None for b in batches):
+        batches = [b if b.lens_glints is not None else replace(b, lens_glints=_no_lens_glints(len(b))) for b in batches]
+        joint["lens_glints"] = joined("lens_glints")
+    return Observations(**joint)
+
+
+def _no_lens_glints(rows: int) -> LensGlintFeatures:
+    return LensGlintFeatures(status=np.zeros((rows, 0), np.int8))
 
 
 def _widened(a: Any, width: int) -> Any:

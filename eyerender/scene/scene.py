@@ -15,7 +15,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, Self, overload
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,7 @@ from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
+from ..eye.spectacles import SpectacleLens, demand_through_d, lenses_of
 from ..population.eyes import amplitude_d
 from ..population.people import Person
 from ..population.response import REFERENCE_AGE, responding
@@ -495,17 +496,40 @@ class Scene:
         """Return a spec that does not depend on its folder: absolute paths, and the manifest of a head included."""
         return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
 
-    def eye(self, side: Literal["right", "left"] | str) -> EyeModel:
-        """Build the numeric eye of one side at the scene's wavelength, with the scene's pupil size and margin."""
+    def eye(self, side: Literal["right", "left"] | str, head_mm: tuple[float, ...] | None = None) -> EyeModel:
+        """Build the numeric eye of one side at the scene's wavelength, with the scene's pupil size, margin and glasses.
+
+        `head_mm` is the head's displacement, which lenses on the rig do not follow; default: the first one.
+        """
         eye, same = self.spec.eye, _Same(self.eye_file(side))
         if self.spec.person is None and (state := _state_of(self.spec, self.rig)) is not None:
             same = _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
-        return _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
+        built = _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
+        lenses = lenses_of(self.spec.subject.spectacles, side)
+        on_rig = any(lens.mount == "rig" for lens in lenses)
+        head = self.spec.subject.head_positions_mm[0] if head_mm is None else head_mm
+        return _wearing(_Same(built), lenses, tuple(head) if on_rig else None) if lenses else built
 
     def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
         """Build the numeric eyes of an index, and return which of them each row uses; only observed eyes are built."""
-        sides, which = np.unique(index.eye, return_inverse=True)
-        return [self.eye(EYES[side]) for side in sides], which
+        worn = (lenses_of(self.spec.subject.spectacles, side) for side in EYES)
+        if not any(lens.mount == "rig" for lenses in worn for lens in lenses):
+            sides, which = np.unique(index.eye, return_inverse=True)
+            return [self.eye(EYES[side]) for side in sides], which
+        keys, which = np.unique(np.column_stack([index.eye, index.head_mm]), axis=0, return_inverse=True)
+        return [self.eye(EYES[int(key[0])], tuple(key[1:].tolist())) for key in keys], which.reshape(-1)
+
+    def refuse_spectacles(self, what: str) -> None:
+        """Raise an error for a scene with spectacles.
+
+        Args:
+            what: what does not follow them.
+
+        Raises:
+            InputError: somebody wears spectacles.
+        """
+        if self.spec.subject.spectacles is not None:
+            raise InputError(f"{what} without spectacles so far", source=self.source, path="subject.spectacles")
 
     @property
     def accommodation_d(self) -> float | None:
@@ -707,11 +731,11 @@ def _put(data: dict[str, Any], path: str, value: Any) -> None:
 
 
 def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
-    """Compute the accommodation (D) of a scene's eyes: as given, or what its targets demand without glasses.
+    """Compute the accommodation (D) of a scene's eyes: as given, or what its targets demand.
 
-    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position. The
-    mean refractive error of a drawn person's eyes is added: hyperopes accommodate more, myopes less, and nobody less
-    than 0.
+    The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position, or
+    what glasses make of it at the cornea, on average over the eyes. The mean refractive error of a drawn person's eyes
+    is added: hyperopes accommodate more, myopes less, and nobody less than 0.
     """
     given = spec.subject.accommodation_d
     if given is not None and given != "targets":
@@ -720,6 +744,9 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
         return 0.0
     distance = np.linalg.norm(targets_mm - np.array(spec.subject.head_positions_mm[0]), axis=-1)
     vergence = float(np.mean(1000.0 / np.maximum(distance, 1.0)))
+    if spec.subject.spectacles is not None:
+        worn = [lenses_of(spec.subject.spectacles, side) for side in spec.subject.eyes]
+        vergence = float(np.mean([demand_through_d(lenses, distance) for lenses in worn]))
     if spec.person is not None:
         vergence += spec.person.mean_refraction_d
     return max(vergence, 0.0)
@@ -804,11 +831,14 @@ def _without_person(data: Mapping[str, Any]) -> dict[str, Any]:
     return rest
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Same:
-    """Wrapper of a spec, compared by identity: comparing the content would take a millisecond."""
+_Content = TypeVar("_Content", EyeSpec, EyeModel)
 
-    spec: EyeSpec
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Same(Generic[_Content]):
+    """Wrapper of a spec or an eye, compared by identity: comparing the content would take a millisecond."""
+
+    spec: _Content
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Same) and other.spec is self.spec
@@ -819,8 +849,12 @@ class _Same:
 
 @lru_cache(maxsize=32)
 def _responded(
-    eye: _Same, state: _State, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
-) -> _Same:
+    eye: _Same[EyeSpec],
+    state: _State,
+    wavelength_nm: float,
+    pupil_diameter_mm: float | None,
+    margin: PupilMargin | None,
+) -> _Same[EyeSpec]:
     """Adapt an eye file to the light and the viewing distance of a scene."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     try:
@@ -840,8 +874,15 @@ def _responded(
 
 @lru_cache(maxsize=32)
 def _built_eye(
-    eye: _Same, left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
+    eye: _Same[EyeSpec], left: bool, wavelength_nm: float, pupil_diameter_mm: float | None, margin: PupilMargin | None
 ) -> EyeModel:
     """Build a numeric eye; cached, because observers, renderer and labels request the same one repeatedly."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)
+
+
+@lru_cache(maxsize=64)
+def _wearing(eye: _Same[EyeModel], lenses: tuple[SpectacleLens, ...], head_mm: tuple[float, ...] | None) -> EyeModel:
+    """Put lenses in front of a numeric eye; cached, because observers compare eyes by identity."""
+    bare, head = eye.spec, None if head_mm is None else np.array(head_mm)
+    return replace(bare, worn=tuple(lens.build(bare.side, bare.wavelength_nm, head) for lens in lenses))

@@ -16,6 +16,7 @@ from ..eye.catalogue import load_eye, refuse_unknown
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.spec import EyeSpec
+from ..eye.spectacles import Spectacles
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
@@ -132,12 +133,17 @@ class SubjectSpec(Spec):
     accommodation_d: Accommodation | None = Field(
         default=None,
         description="dioptres to which the eyes are asked to accommodate, or `targets`: what the mean vergence of the "
-        "targets asks of them without glasses, 0 with poses; default: `targets` for a drawn person, else 0",
+        "targets asks of them through the glasses worn, 0 with poses; default: `targets` for a drawn person, else 0",
     )
     age_years: Annotated[float, Field(ge=5, le=100)] | None = Field(
         default=None,
         description="age of eyes that are not drawn, for light and accommodation; default: 28.58, about which the "
         "formula of the pupil turns",
+    )
+    spectacles: Spectacles | None = Field(
+        default=None,
+        description="a lens in front of both eyes, a list of lenses in order from the eye, or `{right: .., left: ..}` "
+        "of these; default: none",
     )
 
 
@@ -263,6 +269,8 @@ class SceneSpec(FileSpec):
 
     def _check_response(self) -> None:
         subject = self.subject
+        if subject.spectacles is not None and self.eye.line_of_sight != "chief_ray":
+            raise KeyProblem("eye.line_of_sight", "must be chief_ray with subject.spectacles")
         if self.person is not None:
             if subject.age_years is not None:
                 raise KeyProblem("subject.age_years", "cannot stand beside a drawn person, who has an age")

@@ -44,6 +44,7 @@ class Setup:
     @classmethod
     def of(cls, scene: Scene) -> Self:
         """Start with the first frame of a scene."""
+        scene.refuse_spectacles("the live page shows scenes")
         spec = scene.spec
         # Eyes respond to the mean of all targets, so they must not respond to the current one only.
         if spec.person is not None or spec.subject.accommodation_d == "targets":

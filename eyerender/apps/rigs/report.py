@@ -98,6 +98,7 @@ def run_rig(
     Raises:
         InputError: the folder is not empty, no drawn eye is physically possible, or a tolerance is that of no part.
     """
+    scene.refuse_spectacles("rigs are reported on")
     whole, scene = scene, scene.of_first_eye()
     survey = survey_of(scene, population, size, unknowns)
     if tolerances is not None:

@@ -124,7 +124,9 @@ class SweepSpec(FileSpec):
     def base(self, folder: Path) -> Scene:
         """Load the base scene, from a file relative to a folder or a shipped one."""
         beside = folder / self.scene
-        return load_scene(beside if beside.is_file() else self.scene)
+        scene = load_scene(beside if beside.is_file() else self.scene)
+        scene.refuse_spectacles("layouts are swept")
+        return scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,219 @@
+"""Spectacle lenses in front of an eye: two more surfaces with a frame of their own, which rays pass in turn.
+
+A ray passes a lens inside its outline and runs beside it outside. So a leg of a path (from a camera, a lamp or a target
+to the eye) is solved for each choice of the lenses that it may pass, and checked: it must cross every lens of the
+choice inside the outline, and must not touch the remaining ones there. A point that is reached both ways counts once,
+through the lens, because choices with more lenses come first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from ..base.arrays import ArrayValue, Bools, Floats, Indices, Statuses
+from ..base.status import Status, mark
+from ..optics.interface import dot, minus, moved
+from ..optics.surfaces import Surface, Xyz, components, join, shift, turn_back
+from ..optics.trace import Crossing, Traced, trace
+
+_REACH = 1.5
+"""A leg whose straight line passes the lens's plane farther out than this part of the outline cannot pass the lens."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class WornLens(ArrayValue):
+    """A lens in the frame of the unrotated eye or, `turned`, in the frames of n turned eyes; arrays may be batches.
+
+    Attributes:
+        front: the surface on the world's side.
+        back: the surface on the eye's side.
+        index: index of refraction.
+        centre_mm: (3,) centre of the outline.
+        rotation: (3, 3) lens to eye frame; its x axis points out of the face.
+        half_mm: (2,) half axes of the elliptical outline along the lens's y and z.
+        reflectances: of front and back at every angle; None: Fresnel's.
+        transmission: of the material.
+    """
+
+    front: Surface
+    back: Surface
+    index: float
+    centre_mm: Floats
+    rotation: Floats
+    half_mm: tuple[float, float]
+    reflectances: tuple[float, float] | None
+    transmission: float
+
+    def turned(self, turn: Floats, shift_mm: Floats) -> WornLens:
+        """Express the lens in frames of turned eyes, x = turn x' + shift_mm, with turn (n, 3, 3) and shift (n, 3)."""
+        back = np.swapaxes(turn, -1, -2)
+        return replace(
+            self,
+            front=self.front.seen_from(shift_mm, turn),
+            back=self.back.seen_from(shift_mm, turn),
+            centre_mm=(back @ (self.centre_mm - shift_mm)[..., None])[..., 0],
+            rotation=back @ self.rotation,
+        )
+
+    def take(self, rows: Indices) -> WornLens:
+        """Select lenses of a batch."""
+        centre, rotation = self.centre_mm[rows], self.rotation[rows]
+        return replace(
+            self, front=self.front.take(rows), back=self.back.take(rows), centre_mm=centre, rotation=rotation
+        )
+
+    def inward(self) -> tuple[Crossing, ...]:
+        """Return the two refractions of light that comes from the world."""
+        return (
+            Crossing(surface=self.front, n_after=self.index),
+            Crossing(surface=self.back, n_after=1.0),
+        )
+
+    def outward(self) -> tuple[Crossing, ...]:
+        """Return the two refractions of light that comes from the eye."""
+        return (
+            Crossing(surface=self.back, n_after=self.index, inward=False),
+            Crossing(surface=self.front, n_after=1.0, inward=False),
+        )
+
+    def local(self, point: Xyz) -> Xyz:
+        """Transform points to the lens's axes, with the centre of the outline as origin."""
+        return turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
+
+    def inside(self, point: Xyz) -> Bools:
+        """Return whether points lie inside the outline, seen along the lens's x axis."""
+        _, y, z = self.local(point)
+        with np.errstate(invalid="ignore"):
+            return np.asarray((y / self.half_mm[0]) ** 2 + (z / self.half_mm[1]) ** 2 <= 1.0)
+
+    def faces(self, point: Xyz) -> Bools:
+        """Return whether points lie on the world's side of the lens."""
+        return np.asarray(self.local(point)[0] > 0.0)
+
+    def reachable(self, end: Xyz) -> Bools:
+        """Return where a leg from points to the eye's apex may pass the lens: from its front, not far beside it."""
+        x, y, z = self.local(end)
+        own_x, own_y, own_z = self.local((np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = x / (x - own_x)
+            y, z = y + part * (own_y - y), z + part * (own_z - z)
+            near = (y / self.half_mm[0]) ** 2 + (z / self.half_mm[1]) ** 2 <= _REACH**2
+        return np.asarray((x > 0.0) & near)
+
+    def touches(self, start: Xyz, end: Xyz) -> Bools:
+        """Return whether straight lines from start to end meet a surface inside the outline."""
+        gap = minus(end, start)
+        length = np.sqrt(dot(gap, gap))
+        way = (gap[0] / length, gap[1] / length, gap[2] / length)
+        found = np.zeros(length.shape, dtype=bool)
+        for surface in (self.front, self.back):
+            for inward in (True, False):
+                hit = surface.hit(start, way, inward)
+                ahead = hit.ok & (hit.distance > 0.0) & (hit.distance < length)
+                found |= ahead & self.inside(moved(start, way, hit.distance))
+        return found
+
+
+Choice = tuple[int, ...]
+"""Numbers of the lenses that a leg passes, in order from the eye."""
+
+
+def choices(count: int) -> list[Choice]:
+    """Return all choices among `count` lenses, those with most lenses first."""
+    return [choice for size in range(count, -1, -1) for choice in combinations(range(count), size)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """A path past worn lenses.
+
+    Attributes:
+        path: the crossings, in order from the viewpoint.
+        owners: number of the lens that each crossing belongs to; None: the eye.
+        lenses: all lenses that are worn.
+    """
+
+    path: tuple[Crossing, ...]
+    owners: tuple[int | None, ...]
+    lenses: tuple[WornLens, ...]
+
+    @classmethod
+    def of(
+        cls,
+        lenses: Sequence[WornLens],
+        before: Choice,
+        middle: Sequence[Crossing],
+        after: Choice = (),
+        own: int | None = None,
+    ) -> Course:
+        """Join what the lenses before and after do to the crossings in the middle.
+
+        Args:
+            lenses: all worn lenses, in order from the eye.
+            before: those passed on the way from the viewpoint, in the order in which they are passed.
+            middle: the crossings of the eye, or those of lens `own` if that is given.
+            after: those passed on the way to the target, in the order in which they are passed.
+            own: number of a lens that reflects the ray.
+        """
+        inwards = own is None or all(k > own for k in (*before, *after))
+        steps = [(c, k) for k in before for c in (lenses[k].inward() if inwards else lenses[k].outward())]
+        back = [(c, k) for k in after for c in (lenses[k].outward() if inwards else lenses[k].inward())]
+        whole = [*steps, *((c, own) for c in middle), *back]
+        return cls(path=tuple(c for c, _ in whole), owners=tuple(k for _, k in whole), lenses=tuple(lenses))
+
+    @property
+    def first_of_eye(self) -> int:
+        """Number of the first crossing that belongs to the eye."""
+        return self.owners.index(None)
+
+    def follow(self, viewpoint: Xyz, way: Xyz, target: Xyz) -> tuple[Traced, Statuses]:
+        """Trace rays from the viewpoint, and check that they pass lenses inside their outlines only.
+
+        Returns:
+            The traced rays, and their statuses: AT_LENS_EDGE where a lens lies in the way or ends too early.
+        """
+        traced = trace(self.path, 1.0, join(viewpoint), join(way))
+        status = np.array(traced.status)
+        points = [viewpoint, *(components(p) for p in traced.points_mm[1:]), target]
+        with np.errstate(invalid="ignore"):
+            for k, owner in enumerate(self.owners):
+                if owner is not None:
+                    mark(status, ~self.lenses[owner].inside(points[k + 1]), Status.AT_LENS_EDGE)
+            for k in self._in_air():
+                ends = {self.owners[i] for i in (k - 1, k) if 0 <= i < len(self.owners)}
+                for j, lens in enumerate(self.lenses):
+                    if j not in ends:
+                        mark(status, lens.touches(points[k], points[k + 1]), Status.AT_LENS_EDGE)
+        return traced, status
+
+    def _in_air(self) -> list[int]:
+        """Return the numbers of the segments in air; segment k ends at crossing k."""
+        last, found = len(self.path), [0]
+        for k in range(1, last + 1):
+            inside_lens = k < last and self.owners[k - 1] is not None and self.owners[k - 1] == self.owners[k]
+            inside_eye = self.owners[k - 1] is None and not self.path[k - 1].reflects
+            if not inside_lens and not inside_eye:
+                found.append(k)
+        return found
+
+
+def reachable_by(lenses: Sequence[WornLens], choice: Choice, end: Xyz) -> Bools:
+    """Return where a leg from points may pass all lenses of a choice."""
+    found = np.ones(np.shape(end[0]), dtype=bool)
+    for k in choice:
+        found &= lenses[k].reachable(end)
+    return found
+
+
+def more_telling(old: Statuses, new: Statuses) -> Statuses:
+    """Choose between failures of two attempts: no attempt, no such ray, a lens's edge, or a reason of the eye."""
+
+    def rank(status: Statuses) -> Floats:
+        lost = (status == Status.MISSED) | (status == Status.NOT_CONVERGED)
+        return np.select([status == Status.NONE, lost, status == Status.AT_LENS_EDGE], [0.0, 1.0, 2.0], 3.0)
+
+    return np.where(rank(new) > rank(old), new, old).astype(np.int8)

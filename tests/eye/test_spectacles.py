@@ -1,0 +1,270 @@
+"""Lenses of spectacles: power and axis by traced rays, where they sit, and what is refused."""
+
+from __future__ import annotations
+
+from decimal import Decimal, getcontext
+from typing import Any
+
+import numpy as np
+import pytest
+
+from eyerender.base.errors import InputError
+from eyerender.eye.spectacles import MATERIALS, NOMINAL_NM, SpectacleLens, demand_through_d, lenses_of
+from eyerender.optics.trace import trace
+from eyerender.scene.spec import SubjectSpec
+
+
+def lens_of(**given):
+    return SpectacleLens.from_mapping(given)
+
+
+def subject(spectacles):
+    return SubjectSpec.from_mapping({"spectacles": spectacles})
+
+
+FLAT = {"pantoscopic_deg": 0.0, "wrap_deg": 0.0}
+
+
+def power_matrix(lens):
+    """Back vertex power (2, 2) in dioptres along the world's y and z, from rays parallel to the lens's axis."""
+    h = 1e-3  # spherical aberration is (h / r)^2 of the power, below 1e-9
+    origins = lens.centre_mm + np.array([[40, 0, 0]]) + np.array([[0, h, 0], [0, -h, 0], [0, 0, h], [0, 0, -h]])
+    traced = trace(lens.inward(), 1.0, origins, np.broadcast_to([-1.0, 0.0, 0.0], (4, 3)))
+    vertex = lens.back.to_eye([0.0, 0.0, 0.0])
+    way, point = traced.directions[-1], traced.points_mm[-1]
+    at_vertex = point + ((vertex[0] - point[:, 0]) / way[:, 0])[:, None] * way - vertex
+    height = (at_vertex[::2, 1:] - at_vertex[1::2, 1:]).T / 2.0
+    slope = ((way[:, 1:] / -way[:, :1])[::2] - (way[:, 1:] / -way[:, :1])[1::2]).T / 2.0
+    return -1000.0 * slope @ np.linalg.inv(height)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("material", MATERIALS)
+def test_power_and_axis_are_those_of_traced_rays(side, material):
+    """Facing the wearer, the examiner has the subject's left (+y) on the right, and up is up, for both eyes."""
+    rng = np.random.default_rng(3)
+    for _ in range(6):
+        sphere, axis = rng.uniform(-6, 6), rng.uniform(0, 180)
+        cylinder = rng.choice([-1, 1]) * rng.uniform(0.25, 3)
+        given = lens_of(sphere_d=sphere, cylinder_d=cylinder, axis_deg=axis, material=material, **FLAT)
+        found = power_matrix(given.build(side, NOMINAL_NM))
+        along = np.array([np.cos(np.radians(axis)), np.sin(np.radians(axis))])
+        across = np.array([-along[1], along[0]])
+        assert along @ found @ along == pytest.approx(sphere, abs=1e-6)
+        assert across @ found @ across == pytest.approx(sphere + cylinder, abs=1e-6)
+        turned = 0.5 * np.arctan2(2 * found[0, 1], found[0, 0] - found[1, 1])
+        turned += np.pi / 2 if cylinder > 0 else 0.0
+        off = (np.degrees(turned) - axis + 90) % 180 - 90
+        assert abs(off) < 1e-6
+
+
+def test_power_at_850_nm_is_lower_by_the_dispersion():
+    """The notes of the trade: 0.965 to 0.982 of the nominal power; a -6 D polycarbonate lens is -5.79 D."""
+    lens = lens_of(sphere_d=-6.0, material="polycarbonate", **FLAT).build("right", 850.0)
+    assert power_matrix(lens)[0, 0] == pytest.approx(-5.79, abs=0.005)
+    for name, medium in MATERIALS.items():
+        share = (medium.index(850.0) - 1) / (medium.index(NOMINAL_NM) - 1)
+        assert 0.960 < share < 0.985, name
+
+
+def test_indices_are_those_published():
+    """Polycarbonate: n_d 1.5846 and n_e 1.5898 (Sultanova 2009). Others: n_d and the Abbe number of the trade."""
+    poly = MATERIALS["polycarbonate"]
+    assert [round(poly.index(nm), 4) for nm in (546.07, 850.0)] == [1.5898, 1.5688]
+    cr39 = MATERIALS["CR-39"]
+    assert cr39.index(587.56) == pytest.approx(1.4985, abs=1e-12)
+    assert (cr39.index(587.56) - 1) / (cr39.index(486.13) - cr39.index(656.27)) == pytest.approx(58.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(("sphere", "base"), [(4.0, 10.0), (0.0, 6.0), (-4.0, 4.0), (-14.0, 0.5)])
+def test_the_front_follows_vogels_rule(sphere, base):
+    lens = lens_of(sphere_d=sphere, index=1.5, outline_mm=(15.0, 12.0)).build("right", 850.0)
+    sag = float(lens.front.sag(1e-2, 0.0))
+    assert -2.0 * sag / 1e-4 == pytest.approx(base / 500.0, rel=1e-6)
+
+
+def test_edges_and_centres_are_thick_enough():
+    for sphere in (-8.0, -2.0, 0.0, 3.0, 7.0):
+        lens = lens_of(sphere_d=sphere, cylinder_d=1.0, axis_deg=40.0, decentration_mm=(3.0, -1.0), **FLAT)
+        for side in ("right", "left"):
+            worn = lens.build(side, 850.0)
+            angle = np.linspace(0, 2 * np.pi, 200)
+            y, z = 27 * np.cos(angle), 20 * np.sin(angle)
+            start = np.stack([np.full_like(y, 60.0), y, z], axis=-1)
+            way = np.broadcast_to([-1.0, 0.0, 0.0], start.shape)
+            ends = [surface.intersect(start, way)[0] for surface in (worn.front, worn.back)]
+            thickness = ends[1] - ends[0]
+            assert thickness.min() > 0.999
+            assert thickness.min() < 1.6 or sphere < 0
+
+
+@pytest.mark.parametrize(("side", "sign"), [("right", 1.0), ("left", -1.0)])
+def test_lenses_sit_where_the_contract_puts_them(side, sign):
+    """p = o + A p_lens, A = Rz(s wrap) Ry(pantoscopic), s = -1 for a right eye; decentration moves the optics only."""
+    made = {"front_radius_mm": 90.0, "back_radius_mm": 60.0, "thickness_mm": 2.5, "index": 1.5}
+    lens = lens_of(
+        surfaces=made, vertex_mm=14.0, pantoscopic_deg=10.0, wrap_deg=6.0, decentration_mm=(2.0, -1.0)
+    ).build(side, 850.0)
+    p, w = np.radians(10.0), np.radians(-sign * 6.0)
+    axis = np.array([np.cos(w) * np.cos(p), np.sin(w) * np.cos(p), -np.sin(p)])
+    assert np.allclose(lens.rotation[:, 0], axis, atol=1e-15)
+    assert axis[2] < 0
+    assert sign * axis[1] < 0
+    o = np.array([14.0, sign * 2.0, -1.0])
+    assert np.allclose(lens.back.to_eye([0.0, 0.0, 0.0]), o, atol=1e-14)
+    assert np.allclose(lens.front.to_eye([0.0, 0.0, 0.0]), o + 2.5 * axis, atol=1e-14)
+    assert np.allclose(lens.centre_mm, [14.0, 0.0, 0.0])
+    # A radius > 0 has its centre on the eye's side.
+    centre = o + (2.5 - 90.0) * axis
+    assert abs(lens.front.implicit(centre + 90.0 * np.array([1.0, 0.0, 0.0]))) < 1e-9
+
+
+def test_inserts_stay_with_the_rig():
+    head = np.array([1.0, 2.0, -3.0])
+    on_head = lens_of(sphere_d=-2.0).build("right", 850.0, head)
+    on_rig = lens_of(sphere_d=-2.0, mount="rig").build("right", 850.0, head)
+    assert np.allclose(on_rig.centre_mm, on_head.centre_mm - head)
+    assert np.allclose(on_rig.rotation, np.eye(3))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 11.0, 37.0])
+def test_a_plane_plate_displaces_rays_by_the_closed_form(tilt):
+    """t sin i (1 - cos i / (n cos i'))."""
+    n, t = 1.523, 3.7
+    plate = {"front_radius_mm": None, "back_radius_mm": None, "thickness_mm": t, "index": n}
+    lens = lens_of(surfaces=plate, pantoscopic_deg=tilt, wrap_deg=0.0).build("left", 850.0)
+    traced = trace(lens.inward(), 1.0, np.array([60.0, 1.0, 2.0]), np.array([-1.0, 0.0, 0.0]))
+    assert np.allclose(traced.directions[-1], [-1.0, 0.0, 0.0], atol=1e-15)
+    i = np.radians(tilt)
+    inside = np.arcsin(np.sin(i) / n)
+    wanted = t * np.sin(i) * (1 - np.cos(i) / (n * np.cos(inside)))
+    assert np.linalg.norm(traced.points_mm[-1, 1:] - [1.0, 2.0]) == pytest.approx(wanted, abs=1e-9)
+
+
+def vector(values):
+    return [Decimal(float(v)) for v in values]
+
+
+def inner(a, b):
+    return sum((x * y for x, y in zip(a, b, strict=True)), Decimal(0))
+
+
+def precise_trace(lens, given, point, way):
+    """Points of a ray on both surfaces, by bisection and Snell's law in 40 digits; x = h(y, z) in the lens's frame."""
+    getcontext().prec = 40
+    turn = [[Decimal(float(v)) for v in row] for row in lens.back.rotation.T]
+    index, before = Decimal(float(lens.index)), Decimal(1)
+    found = []
+    for surface, radii, q, after in (
+        (lens.front, given["front_radius_mm"], given.get("front_asphericity", 0.0), index),
+        (lens.back, given["back_radius_mm"], given.get("back_asphericity", 0.0), Decimal(1)),
+    ):
+        ry, rz = (radii, radii) if not isinstance(radii, list) else radii
+        cy, cz = (Decimal(0) if r is None else 1 / Decimal(float(r)) for r in (ry, rz))
+        k = 1 + Decimal(float(q))
+
+        def height(y, z, cy=cy, cz=cz, k=k):
+            root = (1 - k * cy * cy * y * y - k * cz * cz * z * z).sqrt()
+            return -(cy * y * y + cz * z * z) / (1 + root)
+
+        gap = [a - b for a, b in zip(point, vector(surface.origin_mm), strict=True)]
+        p, d = [inner(row, gap) for row in turn], [inner(row, way) for row in turn]
+
+        def above(s, p=p, d=d, height=height):
+            x, y, z = (a + s * b for a, b in zip(p, d, strict=True))
+            return x - height(y, z)
+
+        middle = -p[0] / d[0]
+        low, high = middle - 8, middle + 8
+        assert above(low) > 0 > above(high)
+        for _ in range(130):
+            s = (low + high) / 2
+            low, high = (s, high) if above(s) > 0 else (low, s)
+        _, y, z = (a + low * b for a, b in zip(p, d, strict=True))
+        step = Decimal("1e-15")
+        slopes = [(height(y + step, z) - height(y - step, z)) / (2 * step),
+                  (height(y, z + step) - height(y, z - step)) / (2 * step)]  # fmt: skip
+        normal = [Decimal(1), -slopes[0], -slopes[1]]
+        size = inner(normal, normal).sqrt()
+        normal = [v / size for v in normal]
+        eta, cosine = before / after, -inner(d, normal)
+        behind = (1 - eta * eta * (1 - cosine * cosine)).sqrt()
+        bent = [eta * a + (eta * cosine - behind) * b for a, b in zip(d, normal, strict=True)]
+        way = [inner(column, bent) for column in zip(*turn, strict=True)]
+        point = [a + low * b for a, b in zip(point, [inner(c, d) for c in zip(*turn, strict=True)], strict=True)]
+        before = after
+        found.append(point)
+    return found, way
+
+
+def test_random_rays_through_random_lenses_agree_with_root_finding_in_high_precision():
+    rng = np.random.default_rng(11)
+    worst = 0.0
+    for number in range(100):
+        kind = number % 3
+        radius = [float(rng.uniform(40, 200) * rng.choice([-1, 1])) for _ in range(2)]
+        index = float(rng.uniform(1.45, 1.75))
+        given: dict[str, Any] = {"thickness_mm": 9.0, "index": index, "front_radius_mm": abs(radius[0]),
+                 "back_radius_mm": radius[1]}  # fmt: skip
+        if kind == 0:
+            given |= {"front_asphericity": float(rng.uniform(-1, 0.5)), "back_asphericity": float(rng.uniform(-1, 0.5))}
+        elif kind == 1:
+            given |= {"back_radius_mm": [float(rng.uniform(50, 90)), float(rng.uniform(50, 90))]}
+        else:
+            given |= {"front_radius_mm": None}
+        tilts = {"pantoscopic_deg": float(rng.uniform(-20, 20)), "wrap_deg": float(rng.uniform(-20, 20))}
+        lens = lens_of(surfaces=given, outline_mm=(12.0, 12.0), **tilts).build("right", 850.0)
+        start = np.array([60.0, *rng.uniform(-8, 8, 2)])
+        way = np.array([-1.0, *rng.uniform(-0.1, 0.1, 2)])
+        way /= np.linalg.norm(way)
+        traced = trace(lens.inward(), 1.0, start, way)
+        points, after = precise_trace(lens, given, vector(start), vector(way))
+        exact = np.array([[float(v) for v in p] for p in points])
+        worst = max(worst, np.abs(traced.points_mm[1:] - exact).max())
+        assert np.abs(traced.directions[-1] - [float(v) for v in after]).max() < 1e-12
+    assert worst < 1e-9  # rounding of coordinates of 60 mm is 1e-14
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"sphere_d": -25.0}, "outline_mm: is wider than a surface of the lens reaches"),
+        ({"sphere_d": 5.0, "thickness_mm": 1.0}, "thickness_mm: the surfaces cross inside the outline; add"),
+        ({"sphere_d": 1.0, "index": 1.0}, "index: must be > 1 for a lens with power"),
+        ({"material": "CR-39", "index": 1.5}, "index: cannot stand beside `material`"),
+        ({"surfaces": {"front_radius_mm": 90.0, "back_radius_mm": [60.0, 70.0], "thickness_mm": 2.0, "index": 1.5,
+                       "back_asphericity": 0.0}}, "surfaces.back_asphericity: needs one radius"),
+        ({"surfaces": {"front_radius_mm": 90.0, "back_radius_mm": 60.0, "thickness_mm": 2.0, "index": 1.5},
+          "sphere_d": -1.0}, "sphere_d: cannot stand beside `surfaces`"),
+        ({"surfaces": {"front_radius_mm": 90.0, "back_radius_mm": 60.0, "thickness_mm": 2.0, "index": 0.5}},
+         "surfaces.index: must be >= 1"),
+        ({"reflectance": [0.1, 1.5]}, "reflectance.1: must be < 1"),
+        ({"frame": {}}, "frame: unknown key"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(given, message):
+    with pytest.raises(InputError) as error:
+        lens_of(**given)
+    assert str(error.value).startswith(message)
+
+
+def test_one_lens_a_list_or_each_eye_its_own():
+    one, two = {"sphere_d": -1.0}, {"sphere_d": -2.0, "mount": "rig"}
+    assert len(lenses_of(subject(one).spectacles, "left")) == 1
+    assert [x.mean_d for x in lenses_of(subject([one, two]).spectacles, "right")] == [-1.0, -2.0]
+    sides = subject({"right": one, "left": [one, two]}).spectacles
+    assert [len(lenses_of(sides, side)) for side in ("right", "left")] == [1, 2]
+    assert lenses_of(subject({"left": one}).spectacles, "right") == ()
+    with pytest.raises(InputError, match=r"spectacles\.left\.sphere_d: must be <= 30"):
+        subject({"left": {"sphere_d": 40.0}})
+    with pytest.raises(InputError, match="spectacles: needs at most 2 entries"):
+        subject([one, one, two])
+
+
+def test_a_myope_behind_spectacles_accommodates_less():
+    """Target 333 mm from the cornea, vertex distance 13 mm: 2.59 D for -6 D, instead of 3.00 D."""
+    distance = np.array([1000.0 / 3.0])
+    far = -6.0 / (1 + 0.013 * 6.0)
+    asked = demand_through_d((lens_of(sphere_d=-6.0),), distance)[0] + far
+    assert asked == pytest.approx(2.59, abs=0.005)
+    assert demand_through_d((), distance)[0] == pytest.approx(3.0)
