@@ -12,6 +12,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Indices
 from ..base.errors import InputError
 from ..base.status import Status
+from ..eye.legs import LensImage, lens_images
 from ..eye.model import EyeModel
 from ..eye.pose import Poses
 from ..optics.ellipse import fit_ellipse_direct
@@ -27,7 +28,6 @@ from ..scene.observation import (
     PupilFeatures,
 )
 from .features import Features, features
-from .legs import LensImage, lens_images
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0

@@ -8,13 +8,13 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Statuses
 from ..base.status import Status, mark
+from ..eye.legs import mirrored_legs, refracted_legs
 from ..eye.model import EyeModel
 from ..eye.worn import WornLens
 from ..optics.interface import dot
 from ..optics.purkinje import purkinje_points
 from ..optics.solve import mirrored_rays
 from ..optics.surfaces import Xyz, components, fit, join, shift, turn
-from .legs import mirrored_legs, refracted_legs
 
 _AHEAD_MM = 500.0
 _ASIDE = 0.1

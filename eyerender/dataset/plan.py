@@ -161,9 +161,6 @@ class Plan:
         Raises:
             InputError: a file cannot be read.
         """
-        if "spectacles" in (spec.scene.get("subject") or {}):
-            reason = "pictures are rendered without spectacles so far"
-            raise InputError(reason, source=source, path="scene.subject.spectacles")
         eyes: dict[str, Mapping[str, Any]] = {}
         sums: dict[str, str] = {}
         for name in _eye_names(spec, source):

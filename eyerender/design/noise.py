@@ -123,7 +123,7 @@ def blur_px(scene: Scene, camera: PinholeCamera, eye_mm: Floats) -> float:
     """
     sensor, motion = scene.spec.sensor, scene.spec.motion
     pupil = eye_mm + np.array([-PUPIL_DEPTH_MM, 0.0, 0.0])
-    depth = float(camera.R[2] @ pupil + camera.t[2])
+    depth = float(camera.depth(pupil))
     disc = 0.0 if scene.spec.lens.focus_mm is None else float(confusion_px(scene.spec.lens, camera, sensor, depth))
     variance = sensor.psf_sigma_px**2 + 1.0 / 12.0 + disc**2 / 16.0
     if motion is not None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..base.arrays import ArrayValue, Bools, Floats, Indices, Statuses
 from ..base.status import Status, mark
-from ..optics.interface import dot, minus, moved
+from ..optics.interface import dot, fresnel, minus, moved
 from ..optics.surfaces import Surface, Xyz, components, join, shift, turn_back
 from ..optics.trace import Crossing, Traced, trace
 
@@ -59,8 +59,12 @@ class WornLens(ArrayValue):
             rotation=back @ self.rotation,
         )
 
-    def take(self, rows: Indices) -> WornLens:
-        """Select lenses of a batch."""
+    def behind(self, M: Floats, shift_mm: Floats) -> WornLens:
+        """Express the lens in the frame of one turned eye, x = M x' + shift_mm."""
+        return self.turned(M[None], shift_mm[None]).take(0)
+
+    def take(self, rows: Indices | int | None) -> WornLens:
+        """Select lenses of a batch; None makes a batch of one."""
         centre, rotation = self.centre_mm[rows], self.rotation[rows]
         return replace(
             self, front=self.front.take(rows), back=self.back.take(rows), centre_mm=centre, rotation=rotation
@@ -94,15 +98,15 @@ class WornLens(ArrayValue):
         """Return whether points lie on the world's side of the lens."""
         return np.asarray(self.local(point)[0] > 0.0)
 
-    def reachable(self, end: Xyz) -> Bools:
-        """Return where a leg from points to the eye's apex may pass the lens: from its front, not far beside it."""
+    def reachable(self, end: Xyz, towards: Xyz) -> Bools:
+        """Return where a leg from points towards others may pass the lens: from its front, not far beside it."""
         x, y, z = self.local(end)
-        own_x, own_y, own_z = self.local((np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)))
+        own_x, own_y, own_z = self.local(towards)
         with np.errstate(divide="ignore", invalid="ignore"):
             part = x / (x - own_x)
             y, z = y + part * (own_y - y), z + part * (own_z - z)
             near = (y / self.half_mm[0]) ** 2 + (z / self.half_mm[1]) ** 2 <= _REACH**2
-        return np.asarray((x > 0.0) & near)
+        return np.asarray((x > 0.0) & (own_x < 0.0) & near)
 
     def touches(self, start: Xyz, end: Xyz) -> Bools:
         """Return whether straight lines from start to end meet a surface inside the outline."""
@@ -166,9 +170,34 @@ class Course:
         return cls(path=tuple(c for c, _ in whole), owners=tuple(k for _, k in whole), lenses=tuple(lenses))
 
     @property
-    def first_of_eye(self) -> int:
-        """Number of the first crossing that belongs to the eye."""
-        return self.owners.index(None)
+    def first_of_eye(self) -> int | None:
+        """Number of the first crossing that belongs to the eye; None without any."""
+        return self.owners.index(None) if None in self.owners else None
+
+    def share(self, traced: Traced) -> Floats:
+        """Compute the share of the light that the lenses pass or mirror along traced rays.
+
+        A lens passes (1 - R1) (1 - R2) / (1 - R1 R2) times the transmission of its material, with the light that goes
+        to and fro inside. A reflection is R, times (1 - R)^2 if it is behind a surface.
+        """
+        whole, known = np.ones(traced.status.shape), np.ones(traced.status.shape)
+        for k, (crossing, owner) in enumerate(zip(self.path, self.owners, strict=True)):
+            if owner is None:
+                continue
+            lens = self.lenses[owner]
+            if lens.reflectances is None:
+                normal = join(crossing.surface.gradient_at(components(traced.points_mm[k + 1])))
+                cosine = np.sum(normal * traced.directions[k], axis=-1) / np.linalg.norm(normal, axis=-1)
+                outer = (1.0, lens.index)
+                facing = crossing.inward == (crossing.surface is lens.front)
+                reflected = fresnel(np.abs(cosine), *(outer if facing else outer[::-1])).unpolarized
+            else:
+                reflected = np.full(whole.shape, lens.reflectances[crossing.surface is lens.back])
+            whole = whole * (reflected if crossing.reflects else 1.0 - reflected)
+            if k > 0 and self.owners[k - 1] == owner and not crossing.reflects:
+                whole = whole * lens.transmission / (1.0 if self.path[k - 1].reflects else 1.0 - known * reflected)
+            known = reflected
+        return whole
 
     def follow(self, viewpoint: Xyz, way: Xyz, target: Xyz) -> tuple[Traced, Statuses]:
         """Trace rays from the viewpoint, and check that they pass lenses inside their outlines only.
@@ -201,11 +230,12 @@ class Course:
         return found
 
 
-def reachable_by(lenses: Sequence[WornLens], choice: Choice, end: Xyz) -> Bools:
-    """Return where a leg from points may pass all lenses of a choice."""
+def reachable_by(lenses: Sequence[WornLens], choice: Choice, end: Xyz, towards: Xyz | None = None) -> Bools:
+    """Return where a leg from points towards others, by default the eye's apex, may pass all lenses of a choice."""
     found = np.ones(np.shape(end[0]), dtype=bool)
+    nothing = np.zeros(found.shape)
     for k in choice:
-        found &= lenses[k].reachable(end)
+        found &= lenses[k].reachable(end, towards or (nothing, nothing, nothing))
     return found
 
 

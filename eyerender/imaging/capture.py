@@ -14,6 +14,7 @@ from ..backends.choose import BackendChoice, choose_backend
 from ..base.arrays import Bytes, Floats, Singles
 from ..base.errors import InputError
 from ..base.progress import COMPILING, Progress, followed_by, one_behind
+from ..eye.legs import apparent_places
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..eye.refraction import at_cornea_d
@@ -68,6 +69,11 @@ class EyeImage:
         """Name of the image's files: the number of the frame and the eye."""
         index = self.frame.index
         return f"{index.frame[0]:06d}_{EYES[index.eye[0]]}"
+
+    @property
+    def apex_mm(self) -> Floats:
+        """Apex of the unrotated eye in the world, (3,) mm."""
+        return np.asarray(self.frame.index.eye_position_mm[0] + self.frame.index.head_mm[0])
 
     @property
     def scene(self) -> RenderableScene:
@@ -209,7 +215,7 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         raise InputError(f"none lights the {side} eye; name it in `eyes` of one", path="rig.lights")
     view, window = scene.rig.cameras[camera], scene.window(camera, head, int(index.eye[row]))
     return RenderJob(
-        eye=scene.eye(side),
+        eye=scene.eye(side, tuple(index.head_mm[row])),
         M=M,
         t=t,
         camera=view.unflipped,
@@ -241,6 +247,9 @@ def focus_dpt(frames: RenderableFrames, row: int) -> float:
     if (accommodation := scene.accommodation_d) is not None:
         return far + accommodation
     gap = index.target_mm[row] - (index.eye_position_mm[row] + index.head_mm[row])
+    eye = scene.eye(EYES[index.eye[row]], tuple(index.head_mm[row]))
+    if eye.worn and np.isfinite(gap).all():
+        gap = apparent_places(eye.worn, gap[None])[0]
     target = 1e3 / float(np.linalg.norm(gap)) if np.isfinite(gap).all() else 0.0
     return max(target, far)
 
@@ -275,7 +284,8 @@ def check_windows(scene: RenderableScene) -> None:
     Raises:
         InputError: they cannot.
     """
-    scene.refuse_spectacles("pictures are rendered")
+    if scene.spec.image.surfaces == "mesh":
+        scene.refuse_spectacles("meshes of the eye are rendered")
     spp = scene.spec.image.spp
     for i in range(len(scene.rig.cameras)):
         width, height = scene.window_size_px(i)

@@ -27,6 +27,7 @@ from ..region.limbus import lower
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..scene.observation import EYES, Observations
 from ..scene.parts import IRIS, PUPIL
+from ..scene.viewer import past_lenses
 from .capture import EyeImage, eye_motion
 from .renderable import RenderableFrames, RenderableScene
 
@@ -42,7 +43,7 @@ class EyeInWindow:
     """An eye in a window, without the image: row `row` of frames, its `camera` and `window`.
 
     The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame is placed in the world by x_world = M x
-    + t.
+    + t; the apex of the unrotated eye is at apex_mm.
     """
 
     row: int
@@ -51,6 +52,7 @@ class EyeInWindow:
     eye: EyeModel
     M: Floats
     t: Floats
+    apex_mm: Floats
 
     @classmethod
     def of(cls, frames: RenderableFrames, row: int) -> EyeInWindow:
@@ -58,7 +60,9 @@ class EyeInWindow:
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
-        return cls(row=row, camera=camera, window=scene.window(camera, head, side), eye=scene.eye(EYES[side]), M=M, t=t)
+        eye = scene.eye(EYES[side], tuple(index.head_mm[row]))
+        apex = index.eye_position_mm[row] + index.head_mm[row]
+        return cls(row=row, camera=camera, window=scene.window(camera, head, side), eye=eye, M=M, t=t, apex_mm=apex)
 
 
 def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
@@ -230,7 +234,7 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     points = surface.origin_mm + local @ np.asarray(surface.rotation).T
     eyepoint = rotated(view.M.T, camera.nodal_point_mm - view.t)
     facing = np.sum(surface.normal(points) * (eyepoint - points), axis=-1) > 0
-    pixels, front = camera.project(points @ view.M.T + view.t)
+    pixels, front = past_lenses(camera, view.eye.worn, view.apex_mm).project(points @ view.M.T + view.t)
     reason = None
     if not front.all():
         reason = "behind the camera"

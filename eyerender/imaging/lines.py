@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from ..eye.spectacles import lenses_of
 from ..folders.imagefolder import FILE_KEYS, IMAGE_SCHEMA
 from ..rig.camera import Window
 from ..scene import Scene
@@ -62,10 +63,17 @@ def image_line(
             "camera": record["camera"],
             **dict.fromkeys(DRAWN_KEYS),
             **(drawn or {}),
-            **dict.fromkeys(("spectacles", "contact_lens")),
+            "spectacles": _worn(scene, record["eye"]),
+            "contact_lens": None,
             **scene.person_numbers(record["eye"]),
             # Stored as text, because their nested keys may differ between images, which table columns do not allow.
             "scene_json": json.dumps(tree, sort_keys=True),
             "eye_json": json.dumps({key: value for key, value in eye.items() if key != "sources"}, sort_keys=True),
         },
     }
+
+
+def _worn(scene: Scene, side: str) -> str | None:
+    """Return the lenses in front of one eye as text, from the eye on; None without any."""
+    lenses = lenses_of(scene.spec.subject.spectacles, side)
+    return json.dumps([lens.to_mapping() for lens in lenses], sort_keys=True) if lenses else None

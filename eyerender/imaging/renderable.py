@@ -93,8 +93,8 @@ class RenderableScene(TraceableScene, Protocol):
         """Raise an error where spectacles are worn."""
         ...
 
-    def eye(self, side: str) -> EyeModel:
-        """Return the numeric eye of a side."""
+    def eye(self, side: str, head_mm: tuple[float, ...] | None = None) -> EyeModel:
+        """Return the numeric eye of a side, with the lenses worn at a position of the head."""
         ...
 
     def refraction_d(self, side: str) -> float:

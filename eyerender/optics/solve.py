@@ -136,7 +136,15 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
     return joined_rays((mirroring(surface, rim_mm),), 1.0, viewpoint, source)
 
 
-def joined_rays(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rimmed: int = 0) -> Rays:
+def joined_rays(
+    path: Sequence[Crossing],
+    n_outside: float,
+    viewpoint: Xyz,
+    target: Xyz,
+    rimmed: int = 0,
+    *,
+    thorough: bool = True,
+) -> Rays:
     """Solve for the rays from viewpoints through a path to targets: refracted ones, or those that a surface reflects.
 
     Args:
@@ -146,6 +154,7 @@ def joined_rays(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, targ
         target: components of the targets; both broadcast.
         rimmed: number of the crossing whose rim counts, the outermost one of the eye. Surfaces in front of it (lenses
             of spectacles) have none here.
+        thorough: whether to search for rays that the compiled solver does not find.
     """
     edge, graphs = path[rimmed], graphs_of(*(crossing.surface for crossing in path))
     if graphs is None:
@@ -156,10 +165,10 @@ def joined_rays(path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, targ
         media = (n_outside, *(crossing.n_after for crossing in path))
         ladder = np.stack(np.broadcast_arrays(*(np.atleast_1d(n) for n in media)), axis=-1)
         rays, found, guess = _joined(graphs, ladder, edge.rim_mm, viewpoint, target, edge.reflects, rimmed)
-        if not found.all():
+        if thorough and not found.all():
             aim = guess if edge.reflects else target
             rays = _searched(path, n_outside, viewpoint, target, aim, rays, ~found)
-    return rays if edge.reflects else _launched(path, n_outside, viewpoint, target, rays)
+    return rays if edge.reflects or not thorough else _launched(path, n_outside, viewpoint, target, rays)
 
 
 def _joined(

@@ -112,7 +112,7 @@ class Surface(ABC):
     def local_sag(self, y: Floats, z: Floats) -> Floats:
         """Compute the depth x of the sheet over the local (y, z); NaN where the sheet does not reach."""
 
-    def take(self, index: Indices) -> Self:
+    def take(self, index: Indices | int | None) -> Self:
         """Select surfaces of the batch by `index`; a single surface is returned unchanged."""
         return type(self)(*(part[index] for part in self._parts())) if self.batch_shape else self
 

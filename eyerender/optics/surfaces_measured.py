@@ -194,7 +194,7 @@ class GridSurface(Measured):
         table.append(self.table.ravel())
         return GRID
 
-    def take(self, index: Indices) -> Self:
+    def take(self, index: Indices | int | None) -> Self:
         """Select surfaces of the batch by `index`, with the same table; a single surface is returned unchanged."""
         *parts, table = self._parts()
         return type(self)(*(*(part[index] for part in parts), table)) if self.batch_shape else self

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from eyerender.analytic.legs import lens_images
 from eyerender.analytic.observer import trace
 from eyerender.base.errors import InputError
 from eyerender.base.status import Status
 from eyerender.cli.main import main
+from eyerender.eye.legs import lens_images
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.spectacles import SpectacleLens
 from eyerender.optics.trace import trace as trace_rays

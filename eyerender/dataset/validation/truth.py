@@ -27,6 +27,7 @@ from ...rendering.scene.pixels import lid_margins_px
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
+from ...scene.viewer import past_lenses
 from ..done import picture_file
 from ..ownscenes import GivenScene
 from ..plan import Plan, plan_digest
@@ -263,7 +264,8 @@ def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
 def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
     """Check the spots of the glints: each is the mean of the lamp's image, or lies within it if a part is hidden."""
     eye, camera = view.eye, scene.rig.cameras[view.camera]
-    mirror = GlintScene.of(eye, film_index(eye, scene.spec.look), view.M, view.t, camera, None)
+    lenses = tuple(lens.behind(view.M, view.t - view.apex_mm) for lens in eye.worn)
+    mirror = GlintScene.of(eye, film_index(eye, scene.spec.look), view.M, view.t, camera, None, lenses)
     lights = [scene.rig.lights[k] for k in scene.rig.lights_of(EYES.index(eye.side))]
     images = mirror.images(lights, scene.spec.sensor.psf_sigma_px)
     glints = mirror.glints(lights, images, _all_clear)
@@ -290,10 +292,9 @@ def _lids(scene: Scene, observations: Observations, view: EyeInWindow, line: dic
     """Check the landmarks along the lids; for a head mesh they are unknown and null."""
     expected = None
     if scene.spec.region is not None and scene.spec.region.head is None:
-        index = observations.index
-        anchor = index.head_mm[view.row] + index.eye_position_mm[view.row]
-        margins = lid_margins(scene.spec.region, globe_of(view.eye, view.M, view.t - anchor))
-        expected = lid_margins_px(margins, scene.rig.cameras[view.camera], anchor)
+        margins = lid_margins(scene.spec.region, globe_of(view.eye, view.M, view.t - view.apex_mm))
+        camera = past_lenses(scene.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
+        expected = lid_margins_px(margins, camera, view.apex_mm)
     yield from _summed(differences(expected, line["labels"]["lid_margins_px"], ROUNDED, "labels.lid_margins_px"))
 
 

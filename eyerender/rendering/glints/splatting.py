@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Singles, frozen
+from ...base.arrays import Bools, Cache, Floats, Singles, frozen
 from ...rig import defocus, psf
 from ...rig.camera import Window
 from ...rig.light import Lamp
@@ -17,9 +17,11 @@ from ..scene.background import Background
 from ..scene.blur import Blur
 from ..scene.region import RegionScene, blockers
 from .cutdiscs import POINT, quadrature
+from .lensglints import lens_reflections
 from .purkinje import purkinje_images
 from .tracing import Glint, GlintScene, GlintTable, Image, LampImages, LampSpots, glint_table
 
+_KNOWN: Cache[list[Image]] = Cache(8)
 _FRAMED = "occluded by frame"
 _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
 
@@ -79,6 +81,7 @@ class MirrorImages:
         first: images in the front of the cornea.
         further: requested images of higher orders.
         nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where not needed.
+        in_lenses: images in worn lenses.
     """
 
     job: RenderJob
@@ -87,12 +90,13 @@ class MirrorImages:
     first: LampImages
     further: dict[int, list[Image]]
     nearness: Floats
+    in_lenses: list[Image]
 
     @classmethod
     def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
         """Compute the images, on the host unless a mesh replaces the cornea's front."""
         eye = job.eye
-        scene = GlintScene.of(eye, job.film_index, job.M, job.t, job.camera, mesh)
+        scene = GlintScene.of(eye, job.film_index, job.M, job.t, job.camera, mesh, job.turned_lenses)
         lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
         # These images are small, because their mirrors are strongly curved, or concave with a short focus.
         nodes = [quadrature(3, 14) if lamp.radius_mm > 0 else POINT for lamp in lamps]
@@ -100,7 +104,12 @@ class MirrorImages:
         near = 1 in job.purkinje and job.lens.focus_mm is not None
         nearness = scene.nearness(lamps) if near else np.full((len(lamps), 2), np.nan)
         first = scene.images(lamps, job.sensor.psf_sigma_px)
-        return cls(job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness)
+        # Lenses do not turn with the eye, so frames that differ in gaze only share their reflections.
+        key = eye.worn, lamps, job.camera, job.anchor_mm.tobytes()
+        mirrored = _KNOWN.get(key, lambda: lens_reflections(scene, eye.worn, lamps, job.anchor_mm)) if eye.worn else []
+        return cls(
+            job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness, in_lenses=mirrored
+        )
 
     def seen(self, place: Background | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
         """Return the visible parts of the images in posed surroundings, and their contribution to the blurred image.
@@ -122,6 +131,7 @@ class MirrorImages:
             shines += [
                 Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
             ]
+        shines += [Shine(image.spots, share, blur.subject_px) for image in self.in_lenses]
         others = tuple((order, glint_table(found[:count])) for order, found in further.items())
         return Mirrored(glint_table(glints[:count]), others, reasons), shines
 

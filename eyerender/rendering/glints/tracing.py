@@ -26,12 +26,14 @@ from numpy.typing import NDArray
 
 from ...base.arrays import ArrayValue, Bools, Floats, frozen, join_rows, remembered, take_rows
 from ...base.status import Status
+from ...eye.legs import both_legs, mirror_of, mirrored_legs
 from ...eye.model import EyeModel
+from ...eye.worn import Course, WornLens
 from ...optics.fermat_kernels import RESIDUAL_LIMIT_MM
 from ...optics.interface import fresnel
 from ...optics.shooting import ray_tube
 from ...optics.solve import mirrored_rays
-from ...optics.surfaces import Surface, components, join
+from ...optics.surfaces import Surface, Xyz, components, join
 from ...optics.trace import Crossing
 from ...optics.transforms import normalize, rotated
 from ...rig.camera import PinholeCamera, facing
@@ -146,16 +148,20 @@ class GlintScene:
     t: Floats
     camera: PinholeCamera
     mesh: SurfaceMesh | None = None
+    eye: EyeModel | None = None
+    lenses: tuple[WornLens, ...] = ()
 
     @classmethod
     def of(
-        cls, eye: EyeModel, film_index: float, M: Floats, t: Floats, camera: PinholeCamera, mesh: SurfaceMesh | None
-    ) -> GlintScene:
-        """Create the mirrors of an eye; a mesh replaces the cornea's front."""
+        cls, eye: EyeModel, film_index: float, M: Floats, t: Floats, camera: PinholeCamera, mesh: SurfaceMesh | None,
+        lenses: tuple[WornLens, ...] = (),
+    ) -> GlintScene:  # fmt: skip
+        """Create the mirrors of an eye; a mesh replaces the cornea's front. Lenses are in the eye's frame."""
         return cls(
             surface=eye.front[0], index=float(eye.front_indices[0]), film_index=film_index,
             limbus_radius_mm=float(eye.limbus_radius_mm), sclera_centre_mm=np.asarray(eye.sclera.centre_mm),
             sclera_radius_mm=float(eye.sclera.radius_mm), M=M, t=t, camera=camera, mesh=mesh,
+            eye=eye, lenses=lenses,
         )  # fmt: skip
 
     def images(self, lights: Sequence[Lamp], sigma_px: float) -> LampImages:
@@ -261,7 +267,7 @@ class GlintScene:
         """Compute images of lamps through points of them."""
         sources = (emitters.points - self.t) @ self.M
         r = self._reflect(sources, np.broadcast_to(self.eyepoint, sources.shape))
-        F = fresnel(np.clip(-_dot(r.normal, r.arrives), 0, 1), 1.0, self.index, self.film_index).unpolarized
+        F = fresnel(np.clip(-_dot(r.normal, r.meets), 0, 1), 1.0, self.index, self.film_index).unpolarized * r.passed
         there = r.there & ~self._behind_globe(r.point, sources - r.point)
         there &= ~self._behind_globe(r.point, self.eyepoint - r.point)
         return self.pictured(
@@ -296,6 +302,8 @@ class GlintScene:
     def _reflect(self, sources: Floats, viewpoints: Floats) -> _Reflections:
         """Solve for the points that mirror sources (k, 3) to viewpoints (k, 3); eye frame."""
         lamp, node = components(sources), components(viewpoints)
+        if self.lenses:
+            return self._reflect_behind_lenses(lamp, node)
         rays = mirrored_rays(self.surface, lamp, node, rim_mm=self.limbus_radius_mm)
         # Where a larger cornea would mirror a point, the solver finds the ray too.
         found = np.asarray((rays.status == Status.OK) | (rays.status == Status.OUTSIDE_LIMBUS))
@@ -310,13 +318,39 @@ class GlintScene:
             there = found & (self.surface.axis_distance(components(seen.point)) <= self.limbus_radius_mm)
             return _Reflections(
                 point=seen.point, normal=seen.normal, arrives=seen.arrives, leaves=seen.leaves,
-                cross_section=seen.cross_section, found=found, there=there,
+                cross_section=seen.cross_section, found=found, there=there, meets=seen.arrives, passed=np.ones(len(y)),
             )  # fmt: skip
         mirror = (Crossing(surface=self.surface, n_after=1.0, reflects=True),)
         J = ray_tube(mirror, 1.0, node, rays.way, lamp).cross_section_mm2_sr
         return _Reflections(
             point=y, normal=self.surface.normal(y), arrives=d, leaves=w, cross_section=J, found=found,
-            there=found & (rays.status == Status.OK),
+            there=found & (rays.status == Status.OK), meets=d, passed=np.ones(len(y)),
+        )  # fmt: skip
+
+    def _reflect_behind_lenses(self, lamp: Xyz, node: Xyz) -> _Reflections:
+        """Solve the same past worn lenses, each leg through them or beside."""
+        assert self.eye is not None
+        lenses = [lens.take(None) for lens in self.lenses]
+        legs = mirrored_legs(self.eye, lenses, _one_row(lamp), _one_row(node))
+        seen, exits = join(legs.seen)[0], join(legs.exit)[0]
+        found = np.isfinite(seen).all(axis=1)
+        count, ways = len(found), normalize(np.where(found[:, None], seen - join(node), (1.0, 0.0, 0.0)))
+        section, passed, meets = np.ones(count), np.zeros(count), np.tile((-1.0, 0.0, 0.0), (count, 1))
+        for number, (before, after) in enumerate(both_legs(len(lenses))):
+            rows = np.flatnonzero(found & (legs.passed[0] == number))
+            if len(rows):
+                course = Course.of(lenses, before[::-1], (mirror_of(self.eye),), after)
+                start, goal, way = (components(join(p)[None, rows]) for p in (node, lamp, components(ways)))
+                section[rows] = ray_tube(course.path, 1.0, start, way, goal).cross_section_mm2_sr[0]
+                traced, _ = course.follow(start, way, goal)
+                passed[rows] = course.share(traced)[0]
+                # The ray runs from the camera to the lamp, the light in the opposite direction.
+                meets[rows] = -traced.directions[(course.first_of_eye or 0) + 1][0]
+        arrives = np.where(found[:, None], -join(legs.end)[0], (1.0, 0.0, 0.0))
+        point = np.where(found[:, None], exits, (1.0, 0.0, 0.0))
+        return _Reflections(
+            point=point, normal=self.surface.normal(point), arrives=arrives, leaves=-ways, cross_section=section,
+            found=found, there=found & (legs.status[0] == Status.OK), meets=meets, passed=passed,
         )  # fmt: skip
 
     def _behind_globe(self, y: Floats, towards: Floats) -> Bools:
@@ -334,9 +368,18 @@ class _Reflections(MirrorPoints):
 
     Attributes:
         there: (n,) whether they are on the cornea.
+        meets: (n, 3) directions in which the light meets the cornea.
+        passed: (n,) share of the light that lenses in front of the eye let pass.
     """
 
     there: Bools
+    meets: Floats
+    passed: Floats
+
+
+def _one_row(point: Xyz) -> Xyz:
+    x, y, z = point
+    return x[None], y[None], z[None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,7 +19,7 @@ from ...rig.imaging import Ambient
 from ..hits.meshes import Meshes, meshed
 from ..materials.albedo import Textures
 from ..records.frame import DeviceFrame, Lights, Structure, upload_array
-from ..records.job import LampTable, RenderJob, boundary_waves, kinds, panel_lamps, panel_table, tables
+from ..records.job import LampTable, RenderJob, boundary_waves, kinds, lens_kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
 from ..scene.background import Background, Obstacle
 from ..scene.head import HeadScene
@@ -128,9 +128,12 @@ class FrameBuilder:
             region=region is not None,
             ambient=job.ambient.model_copy(update={"sun": None}) != Ambient(),
             scattering=region is not None and region.skin.is_sheet and job.look.scattering is not None,
+            lenses=lens_kinds(job.eye),
+            lit_through=host.through,
         )
         frame = DeviceFrame.upload(structure, host.parameters, boundary_waves(job.eye), tables(job.eye))
-        frame.lights, frame.textures, frame.scene = Lights.upload(host.lamps), textures, surroundings.scene
+        frame.lights = Lights.upload(host.lamps, frame.turned_lenses, host.lit_through)
+        frame.textures, frame.scene = textures, surroundings.scene
         if isinstance(surroundings, RegionScene):
             frame.region = surroundings.skin
         else:

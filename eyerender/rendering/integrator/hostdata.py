@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import Singles
+from ...base.arrays import Bools, Singles
 from ...eye.fundus import FundusLight
 from ...region.mesh import RegionMesh
 from ...rig.camera import Window
@@ -41,7 +41,7 @@ class HostData:
     def compute(cls, job: RenderJob, posed: RegionMesh | None) -> HostData:
         """Compute everything that the image needs."""
         data = cls(job, posed)
-        _ = data.parameters, data.lamps, data.returned, data.patches, data.lid_margins_px
+        _ = data.parameters, data.lamps, data.lit_through, data.returned, data.patches, data.lid_margins_px
         if job.mesh_edge_mm is None:
             _ = data.mirror_images
         if data.posed is not None:
@@ -67,6 +67,18 @@ class HostData:
         """Lamps and sun in the eye frame."""
         job, lights = self.job, self.sunlit.lights
         return LampTable.of(lights, job.M, job.t, len(lights) - len(job.lights))
+
+    @cached_property
+    def lit_through(self) -> Bools:
+        """Which lamps light the eye through worn lenses."""
+        lenses = self.job.turned_lenses
+        return self.lamps.lit_through(lenses) if lenses else np.zeros(len(self.lamps), dtype=bool)
+
+    @property
+    def through(self) -> bool | None:
+        """Whether the lamps light the eye through worn lenses; None if some do."""
+        some, every = bool(self.lit_through.any()), bool(self.lit_through.all())
+        return some if some == every or not some else None
 
     @cached_property
     def returned(self) -> FundusLight:
@@ -114,7 +126,11 @@ class HostData:
     @cached_property
     def lid_margins_px(self) -> dict[str, list[list[float]]] | None:
         """Landmarks along the lids; None for a bare eye."""
-        return None if self.posed is None else lid_margins_px(self.posed, self.job.camera, self.job.anchor_mm)
+        return (
+            None
+            if self.posed is None
+            else lid_margins_px(self.posed, self.job.viewer(thorough=True), self.job.anchor_mm)
+        )
 
     def marks(self, window: Window) -> NDArray[np.uint8]:
         """Classify a window's pixels, row by row, as sums of `FINE`, `WET` and `PLAIN`.
@@ -123,7 +139,7 @@ class HostData:
         only the sheet of skin.
         """
         if window not in self._marks:
-            camera, anchor = self.job.camera, self.job.anchor_mm
+            camera, anchor = self.job.viewer(), self.job.anchor_mm
             fine, wet = supersampled_pixels(self.posed, camera, anchor, window)
             plain = np.zeros_like(fine)
             if self.posed is not None:

@@ -189,7 +189,8 @@ def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3
         Origin, unit direction, and the square root of the weight of its radiance, cos(theta) / (A D): theta is the
         angle to the camera's axis, A is `PinholeCamera.stretch` (1 / cos^3 of a pinhole), D the area on the sensor per
         area without distortion. The weight is 0 where the lens forms no image. Elsewhere it is 1 for a lens with a
-        measured fall-off, which multiplies the picture.
+        measured fall-off, which multiplies the picture. Behind worn lenses, origin and direction are those behind them;
+        the weight has their transmittance.
     """
     fx, fy = frame.camera.focal
     cx, cy = frame.camera.principal
@@ -219,4 +220,7 @@ def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3
         weight = dr.select(imaged, light, 0)
     elif frame.structure.measured_falloff:
         weight = mi.Float(1)
-    return frame.camera.centre, d, weight
+    o, way = frame.camera.centre, d
+    for lens in frame.lenses:
+        o, way, weight = lens.pass_ray(o, way, weight)
+    return o, way, weight

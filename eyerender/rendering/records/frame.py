@@ -15,12 +15,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import Floats, Reals, Singles
+from ...base.arrays import Bools, Floats, Reals, Singles
 from ...rig.distortion import is_fisheye
 from .job import LampTable
 from .parameters import FrameParameters, Kind, Parameters, packed, rebuilt
 from .recording import recorded, syntax
-from .surfaces import DeviceSurface
+from .surfaces import DeviceLens, DeviceSurface
 
 _ALIGNMENT = 64  # bytes; the widest vector of a processor
 SMALL = 0.02  # radius over distance of lamps whose shadows of hairs are finer than a pixel
@@ -86,6 +86,8 @@ class Structure:
         region: whether the eye has a region instead of a background.
         ambient: whether there is light other than that of the lamps.
         scattering: whether skin and sclera have subsurface scattering.
+        lenses: kinds of front and back of the lenses worn, from outside inwards.
+        lit_through: whether the lamps light the eye through the lenses; None if some do.
     """
 
     surfaces: tuple[tuple[Kind, bool], ...]
@@ -95,6 +97,8 @@ class Structure:
     region: bool = False
     ambient: bool = False
     scattering: bool = False
+    lenses: tuple[tuple[Kind, Kind], ...] = ()
+    lit_through: bool | None = False
 
 
 @dataclass(kw_only=True)
@@ -143,6 +147,8 @@ class DeviceFrame(FrameParameters):
         background: surroundings of an eye without a region (`background.BackgroundGeometry`).
         caches: light computed before the samples.
         scene: Mitsuba scene of everything except the eye.
+        lenses: worn lenses in the scene's frame, from outside inwards.
+        turned_lenses: the same in the eye's frame.
     """
 
     structure: Structure
@@ -154,6 +160,8 @@ class DeviceFrame(FrameParameters):
     region: Any = None
     background: Any = None
     scene: Any = None
+    lenses: tuple[DeviceLens, ...] = ()
+    turned_lenses: tuple[DeviceLens, ...] = ()
 
     @classmethod
     def upload(
@@ -181,6 +189,8 @@ class DeviceFrame(FrameParameters):
             )
             for s, (kind, _), table in zip(others.pop("surfaces"), structure.surfaces, tables, strict=True)
         )
+        for name in ("lenses", "turned_lenses"):
+            others[name] = tuple(map(_device_lens, others[name], structure.lenses))
         boundary = PupilBoundary.upload(waves)
         return cls(structure=structure, boundary=boundary, surfaces=surfaces, **others, caches=Caches())
 
@@ -208,6 +218,16 @@ class DeviceFrame(FrameParameters):
     def point_to_scene(self, x: mi.Vector3f) -> mi.Vector3f:
         """Transform a point from the eye frame to the scene's frame: M x + t."""
         return self.vector_to_scene(x) + self.pose.shift
+
+
+def _device_lens(lens: Any, kinds: tuple[Kind, Kind]) -> DeviceLens:
+    front, back = (
+        DeviceSurface(s.origin, s.axes, s.shape, s.eta, kind)
+        for s, kind in zip((lens.front, lens.back), kinds, strict=True)
+    )
+    return DeviceLens(
+        front=front, back=back, centre=lens.centre, axes=lens.axes, half=lens.half, reach=lens.reach, gain=lens.gain
+    )
 
 
 HARMONICS = 32  # largest number of coefficients of the pupil's boundary
@@ -253,28 +273,31 @@ class Lights:
     Attributes:
         count: number of lamps.
         suns: 1 if the last lamp is a sun with sharp shadows, else 0.
-        rows: the numbers of the lamps, as in `LampTable`.
+        rows: the numbers of the lamps, as in `LampTable`; the last one is 1 for lamps whose light passes lenses.
+        lenses: worn lenses in the eye's frame.
     """
 
     count: mi.UInt32
     suns: mi.UInt32
     rows: mi.Float
+    lenses: tuple[DeviceLens, ...] = ()
 
     @classmethod
-    def upload(cls, table: LampTable) -> Lights:
-        """Copy lamps to the device."""
+    def upload(cls, table: LampTable, lenses: tuple[DeviceLens, ...] = (), through: Bools | bool = False) -> Lights:
+        """Copy lamps to the device; `lenses` in the eye's frame shade what they light, some light the eye `through`."""
         rows = np.zeros((max(len(table), 1), _LIGHT_ROW), np.float32)
         rows[: len(table), : table.rows.shape[1]] = table.rows
+        rows[: len(table), 10] = through
         sharp = table.suns and table.widths[-1] < SMALL
         count, suns = (dr.opaque(mi.UInt32, n) for n in (len(table), table.suns if sharp else 0))
-        return cls(count=count, suns=suns, rows=upload_array(rows))
+        return cls(count=count, suns=suns, rows=upload_array(rows), lenses=lenses)
 
     def __getitem__(self, i: mi.UInt32) -> DeviceLamp:
         # Four numbers are gathered at once.
         a, b, c = (dr.gather(mi.Vector4f, self.rows, i * (_LIGHT_ROW // 4) + k) for k in range(3))
         return DeviceLamp(
             position=mi.Vector3f(a.x, a.y, a.z), axis=mi.Vector3f(a.w, b.x, b.y), radius=b.z, intensity=b.w,
-            exponent=c.x, inner_radius=c.y, number=i,
+            exponent=c.x, inner_radius=c.y, number=i, through=c.z, lenses=self.lenses,
         )  # fmt: skip
 
 
@@ -289,6 +312,8 @@ class DeviceLamp:
     exponent: mi.Float
     inner_radius: mi.Float
     number: mi.UInt32
+    through: mi.Float
+    lenses: tuple[DeviceLens, ...]
 
     def point(self, u: mi.Float, sine: mi.Float, cosine: mi.Float) -> mi.Vector3f:
         """Sample the emitting disc or ring, uniformly by area: u in [0, 1) and a direction in its plane."""
@@ -301,6 +326,13 @@ class DeviceLamp:
         """Return point k of the `count` that represent the lamp at grid nodes: its middle, or four around it."""
         turn = (mi.Float(k) + 0.5) * (0.5 * dr.pi)
         return self.point(dr.select(count > 1, 0.5, 0), *dr.sincos(turn))
+
+    def shade(self, x: mi.Vector3f, source: mi.Vector3f) -> mi.Float:
+        """Return the share of the light from a point of the lamp that worn lenses let pass to points x (eye frame)."""
+        share = mi.Float(1)
+        for lens in self.lenses:
+            share *= lens.shade(x, source)
+        return share
 
     @syntax
     def radiant_intensity(self, direction: mi.Vector3f) -> mi.Float:

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import ArrayValue, Floats, frozen, remembered
+from ...base.arrays import ArrayValue, Bools, Floats, frozen, remembered
 from ...base.errors import InputError
 from ...eye.entrance import entrance_pupil
 from ...eye.fundus import FundusLight, Spread, fundus_light
+from ...eye.legs import air_legs, apparent_places
 from ...eye.model import EyeModel
+from ...eye.worn import WornLens, choices
 from ...optics.media import TEARS
 from ...optics.surfaces import Surface
 from ...optics.surfaces_biconic import Biconic
@@ -28,12 +30,14 @@ from ...rig.camera import PinholeCamera, Window
 from ...rig.imaging import Ambient, Lens
 from ...rig.light import Lamp
 from ...rig.sensor import Sensor
+from ...scene.viewer import past_lenses
 from .lattice import lattice
 from .parameters import (
     CameraParameters,
     ImageParameters,
     IrisParameters,
     Kind,
+    LensParameters,
     LimbusParameters,
     Parameters,
     PoseParameters,
@@ -44,6 +48,8 @@ from .parameters import (
 
 _SENSOR, _LOOK, _LENS, _AMBIENT = Sensor(), Look(), Lens(), Ambient()
 _SUN_MM = 1e6
+_APEX = (np.zeros((1, 1)),) * 3
+_LENS_REACH_MM = 40.0  # a lens is not larger
 _POINT_LIKE, _NARROW, _LARGE = 0.015, 0.05, 0.25  # radius of a lamp over its distance
 _PANEL_PARTS = 4  # parts of a panel along each side
 _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
@@ -109,6 +115,15 @@ class RenderJob(ArrayValue):
         return np.asarray(rotated(self.M, _GLOBE_CENTRE_MM) + self.t - _GLOBE_CENTRE_MM)
 
     @property
+    def turned_lenses(self) -> tuple[WornLens, ...]:
+        """Worn lenses in the frame of the turned eye, in order from it."""
+        return tuple(lens.behind(self.M, self.t - self.anchor_mm) for lens in self.eye.worn)
+
+    def viewer(self, *, thorough: bool = False) -> PinholeCamera:
+        """Return the camera, which sees what surrounds the eye past the lenses worn (see `viewer`)."""
+        return past_lenses(self.camera, self.eye.worn, self.anchor_mm, thorough=thorough)
+
+    @property
     def globe(self) -> Globe:
         """Posed globe in the scene's frame."""
         return globe_of(self.eye, self.M, self.t - self.anchor_mm)
@@ -136,6 +151,11 @@ def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
         t=t,
         mirrored=eye.side == "left",
     )
+
+
+def lens_kinds(eye: EyeModel) -> tuple[tuple[Kind, Kind], ...]:
+    """Return the kinds of front and back of each worn lens, from outside inwards."""
+    return tuple((_kind(lens.front), _kind(lens.back)) for lens in eye.worn[::-1])
 
 
 def kinds(eye: EyeModel) -> tuple[tuple[Kind, bool], ...]:
@@ -208,6 +228,25 @@ def parameters_of(job: RenderJob) -> Parameters:
         globe_reach=still.globe_reach,
         backdrop_x=-look.backdrop_distance_mm,
         ambient_irradiance=job.ambient.irradiance_w_m2 * 1e-3,
+        lenses=tuple(_lens_parameters(lens) for lens in job.eye.worn[::-1]),
+        turned_lenses=tuple(_lens_parameters(lens) for lens in job.turned_lenses[::-1]),
+    )
+
+
+def _lens_parameters(lens: WornLens) -> LensParameters:
+    """Return the parameters of a lens; its own transmittance replaces that at normal incidence."""
+    n, (front, back) = lens.index, (lens.front, lens.back)
+    bare = ((n - 1.0) / (n + 1.0)) ** 2
+    first, second = lens.reflectances or (bare, bare)
+    gain = lens.transmission * (1.0 - first) * (1.0 - second) / (1.0 - first * second) / (1.0 - bare) ** 2
+    return LensParameters(
+        front=_surface_parameters(front, 1.0 / n, np.inf),
+        back=_surface_parameters(back, n, np.inf),
+        centre=lens.centre_mm,
+        axes=(lens.rotation[:, 0], lens.rotation[:, 1], lens.rotation[:, 2]),
+        half=lens.half_mm,
+        reach=float(np.linalg.norm(lens.centre_mm)) + _LENS_REACH_MM,
+        gain=gain,
     )
 
 
@@ -340,6 +379,19 @@ class LampTable(ArrayValue):
         ]  # fmt: skip
         return cls(np.reshape(rows, (-1, 10)), suns)
 
+    def lit_through(self, lenses: Sequence[WornLens]) -> Bools:
+        """Return which lamps light the eye's apex through the lenses in its frame, (n,).
+
+        Raises:
+            InputError: a lamp lights it through one of two lenses only.
+        """
+        x, y, z = self.rows[:, 0], self.rows[:, 1], self.rows[:, 2]
+        status = air_legs([lens.take(None) for lens in lenses], _APEX, (x[None], y[None], z[None]))
+        passed = status.passed[0]
+        if ((passed > 0) & (passed < len(choices(len(lenses))) - 1)).any():
+            raise InputError("are rendered only where each lamp passes all lenses or none", path="subject.spectacles")
+        return np.asarray(passed == 0)
+
     def __len__(self) -> int:
         return len(self.rows)
 
@@ -380,7 +432,10 @@ def returned_light(job: RenderJob) -> FundusLight:
         disc_gain=fundus.disc_gain,
     )
     lamps = LampTable.of(job.lights, job.M, job.t).rows[:, :3]
-    return fundus_light(job.eye, lamps, rotated(job.M.T, job.camera.nodal_point_mm - job.t), job.focus_dpt, spread)
+    camera = rotated(job.M.T, job.camera.nodal_point_mm - job.t)
+    if job.eye.worn:
+        lamps, camera = apparent_places(job.turned_lenses, lamps), apparent_places(job.turned_lenses, camera[None])[0]
+    return fundus_light(job.eye, lamps, camera, job.focus_dpt, spread)
 
 
 def _shape(surface: Surface, limbus_mm: float) -> Floats:

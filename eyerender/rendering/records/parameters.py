@@ -130,6 +130,29 @@ class CameraParameters:
     distortion: tuple[Number, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensParameters:
+    """A worn lens in the frame of its surfaces: the scene's for camera rays, the eye's for light of the lamps.
+
+    Attributes:
+        front: the surface on the world's side.
+        back: the surface on the eye's side.
+        centre: (3,) centre of the outline.
+        axes: three unit axes (3,) of the lens; x points out of the face.
+        half: half axes of the outline along y and z, mm.
+        reach: distance from the frame's origin (mm) from which on rays are moved to the lens before they are traced.
+        gain: factor on Fresnel's transmittance of both surfaces.
+    """
+
+    front: SurfaceParameters
+    back: SurfaceParameters
+    centre: Vector
+    axes: tuple[Vector, Vector, Vector]
+    half: tuple[Number, Number]
+    reach: Number
+    gain: Number
+
+
 @dataclass(frozen=True, slots=True)
 class ImageParameters:
     """The stop's Gaussian image seen from outside: lateral magnification, and shift along x (mm)."""
@@ -177,9 +200,13 @@ class Parameters(FrameParameters):
 
     Attributes:
         surfaces: the refracting surfaces in front of the iris, from outside inwards.
+        lenses: worn lenses in the scene's frame, from outside inwards.
+        turned_lenses: the same in the eye's frame.
     """
 
     surfaces: tuple[SurfaceParameters, ...]
+    lenses: tuple[LensParameters, ...] = ()
+    turned_lenses: tuple[LensParameters, ...] = ()
 
 
 def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:

@@ -261,6 +261,55 @@ class DeviceSurface:
         return out, share if mirror else 1 - share, bend.cosine
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceLens:
+    """A worn lens on the device; the attributes are those of `LensParameters`."""
+
+    front: DeviceSurface
+    back: DeviceSurface
+    centre: mi.Vector3f
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
+    half: tuple[mi.Float, mi.Float]
+    reach: mi.Float
+    gain: mi.Float
+
+    def inside(self, x: mi.Vector3f) -> mi.Bool:
+        """Return whether points lie inside the outline."""
+        y, z = (dr.dot(axis, x - self.centre) / half for axis, half in zip(self.axes[1:], self.half, strict=True))
+        return y * y + z * z <= 1
+
+    def pass_ray(self, o: mi.Vector3f, d: mi.Vector3f, weight: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+        """Pass camera rays through the lens or beside it; rays that its edge stops have the weight 0.
+
+        Args:
+            o: origins.
+            d: unit directions.
+            weight: square roots of weights.
+        """
+        start = o + dr.maximum(-dr.dot(o, d) - self.reach, 0) * d
+        near, way, first, hit = self.front.refract(start, d)
+        enters = hit & self.inside(near) & (dr.dot(near - o, d) > 0)
+        far, behind, second, left = self.back.refract(near, way)
+        through = enters & left & self.inside(far)
+        straight, _, _, met = self.back.refract(start, d)
+        stopped = ~through & (enters | (met & self.inside(straight) & (dr.dot(straight - o, d) > 0)))
+        share = dr.sqrt(first * second * self.gain)
+        return (
+            dr.select(through, far, o),
+            dr.select(through, behind, d),
+            weight * dr.select(through, share, dr.select(stopped, 0, 1)),
+        )
+
+    def shade(self, x: mi.Vector3f, lamp: mi.Vector3f) -> mi.Float:
+        """Return the share of light that reaches points from a lamp on straight lines, at normal incidence."""
+        d = lamp - x
+        ahead = dr.dot(self.axes[0], self.centre - x) / dr.dot(self.axes[0], d)
+        passes = (ahead > 0) & (ahead < 1) & self.inside(x + ahead * d)
+        n = self.back.eta
+        bare = dr.square((n - 1) / (n + 1))
+        return dr.select(passes, self.gain * dr.square(1 - bare), 1)
+
+
 def _form_of(jet: Jet) -> NormalForm:
     """Compute the normal form of the graph x - h(y, z) = 0 of a height h."""
     G = mi.Vector3f(1, -jet.y, -jet.z)

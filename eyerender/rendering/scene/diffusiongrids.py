@@ -119,7 +119,7 @@ def _globe_cells(radius_mm: float) -> tuple[Floats, Floats]:
 
 def _in_window(points: Floats, job: RenderJob, spare_mm: float, spare_px: int) -> Bools:
     """Return which points (n, 3) project into a window or its margin."""
-    camera, whole = job.camera, misses_light(job.lens, job.camera, job.window)
+    camera, whole = job.viewer(), misses_light(job.lens, job.camera, job.window)
     x0, y0, width, height = (0, 0, *camera.resolution_px) if whole else job.window
     xy, front = camera.project(points)
     depth = np.maximum(camera.depth(points), 1.0)

@@ -15,7 +15,7 @@ from ..materials.gloss import sheen
 from ..records.frame import ALL, BITS, DeviceFrame, DeviceLamp
 from ..records.recording import syntax
 from ..records.surfaces import DeviceSurface
-from .manifold import Target, connect
+from .manifold import LampConnection, Target, connect
 
 
 def lamp_blocked(
@@ -75,7 +75,8 @@ def direct_light(
     inv2 = dr.rcp(dr.squared_norm(to))
     to *= dr.sqrt(inv2)
     cosine = dr.dot(to, view.normal)
-    received = dr.select(view.matte & (cosine > 0), lamp.radiant_intensity(-to) * cosine * inv2, 0)
+    lit = lamp.radiant_intensity(-to) * cosine * inv2 * lamp.shade(view.point, source)
+    received = dr.select(view.matte & (cosine > 0), lit, 0)
     return received, mi.Float(0) if mirror is None else received * sheen(mirror[0], to, mirror[1], view.gloss)
 
 
@@ -85,7 +86,7 @@ def irradiance(lamp: DeviceLamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi
     inv2 = dr.rcp(dr.squared_norm(to))
     to *= dr.sqrt(inv2)
     cosine = dr.dot(to, normal)
-    return dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2, 0)
+    return dr.select(cosine > 0, lamp.radiant_intensity(-to) * cosine * inv2 * lamp.shade(x, source), 0)
 
 
 @syntax
@@ -287,13 +288,72 @@ class LampPath:
         `ahead_mm` is as for `connect`.
         """
         target = Target(inner, frame.stop.normal if normal is None else normal, image_of(frame, inner))
-        path = connect(surfaces or frame.surfaces, source, target, frame.limbus.radius, active, ahead_mm=ahead_mm)
+        through = frame.structure.lit_through
+        chain = surfaces or frame.surfaces
+        lit_from, beside = source, None
+        if through is not True:
+            beside = connect(chain, source, target, frame.limbus.radius, active, ahead_mm=ahead_mm)
+        if beside is None or through is None:
+            path, lit_from = _through_lenses(frame, lamp, (source, target, chain), beside, active, ahead_mm)
+        else:
+            path = beside
         clear = 1 - opacity(frame, limbal_radius(frame, frame.surfaces[0].point_in(path.entry)))
         enters = path.found & (clear > 0)
-        blocked = lamp_blocked(frame, path.entry, source, True, False, enters)
+        blocked = lamp_blocked(frame, path.entry, lit_from, True, False, enters)
         whole = dr.select(path.found, lamp.radiant_intensity(path.leaving) * path.transfer, 0)
         return cls(
             # Without a path, its entry may not be a number.
             gain=dr.select(enters, whole * clear, 0), whole=whole, entry=path.entry, enters=enters,
             blocked=blocked, failed=path.failed,
         )  # fmt: skip
+
+
+def _through_lenses(
+    frame: DeviceFrame,
+    lamp: DeviceLamp,
+    ends: tuple[mi.Vector3f, Target, tuple[DeviceSurface, ...]],
+    beside: LampConnection | None,
+    active: mi.Bool,
+    ahead_mm: float,
+) -> tuple[LampConnection, mi.Vector3f]:
+    """Solve for paths through worn lenses and the eye, for the lamps that light it through them.
+
+    Args:
+        frame: the frame.
+        lamp: the lamp.
+        ends: points of the lamp, the target, and the surfaces of the eye in front of it.
+        beside: paths past the lenses, for the other lamps; None if there are none.
+        active: active lanes.
+        ahead_mm: as for `connect`.
+
+    Returns:
+        The paths, with their entries into the cornea, and the points in whose direction light arrives there.
+    """
+    source, target, chain = ends
+    lenses = tuple(surface for lens in frame.turned_lenses for surface in (lens.front, lens.back))
+    some = active if beside is None else active & (lamp.through > 0.5)
+    path = connect(
+        (*lenses, *chain), source, target, frame.turned_lenses[0].half[0], some, ahead_mm=ahead_mm, lensed=True
+    )
+    y, w, gain, ok = path.entry - path.leaving, path.leaving, mi.Float(1), mi.Bool(True)
+    for lens in frame.turned_lenses:
+        for surface in (lens.front, lens.back):
+            y, w, _, good = surface.refract(y, w)
+            ok &= good & lens.inside(y)
+        gain *= lens.gain
+    cornea, _, _, met = chain[0].refract(y, w)
+    distance = dr.norm(source - cornea)
+    found = path.found & ok & met
+    path = replace(path, transfer=path.transfer * gain, entry=cornea, found=found)
+    lit_from = cornea - distance * w
+    if beside is None:
+        return path, lit_from
+    through = lamp.through > 0.5
+    merged = LampConnection(
+        transfer=dr.select(through, path.transfer, beside.transfer),
+        entry=dr.select(through, path.entry, beside.entry),
+        leaving=dr.select(through, path.leaving, beside.leaving),
+        found=dr.select(through, path.found, beside.found),
+        failed=dr.select(through, path.failed, beside.failed),
+    )
+    return merged, dr.select(through, lit_from, source)

@@ -70,6 +70,7 @@ def connect(
     *,
     mirror: bool = False,
     ahead_mm: float = 0.0,
+    lensed: bool = False,
 ) -> LampConnection:
     """Solve for paths from `lamp` to `target` through all `surfaces`; points in the eye frame (mm).
 
@@ -81,12 +82,13 @@ def connect(
         active: active lanes.
         mirror: whether the targets lie in front of a single surface that mirrors the light.
         ahead_mm: how far in front of the last surface targets may lie; they are met by extending the path backwards.
+        lensed: whether the first surfaces are those of lenses, so that paths end at the horizon of a later one.
     """
     front = surfaces[0]
     y = (_mirror_guess if mirror else _entry_guess)(front, lamp, target.aim)
     last, steps, transfer = mi.Vector3f(y), mi.UInt32(0), mi.Float(0)
     on, dark = mi.Bool(active), mi.Bool(False)
-    while dr.hint(on, label="manifold", exclude=[surfaces, front, target, mirror, ahead_mm]):
+    while dr.hint(on, label="manifold", exclude=[surfaces, front, target, mirror, ahead_mm, lensed]):
         y, form = front.on_surface(y)
         d = y - lamp
         distance = dr.norm(d)
@@ -107,7 +109,7 @@ def connect(
         steps += 1
         local = front.point_in(y)
         out = local.y * local.y + local.z * local.z > dr.square(reach + 1)
-        dark |= on & (over | out)
+        dark |= on & (over | out | (~good & lensed))
         on &= ~done & (steps < dr.select(dark, _DARK_STEPS, MAX_STEPS))
         last = dr.select(on & ~over, y, last)
         y = dr.select(on, after, y)

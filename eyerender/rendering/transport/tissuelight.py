@@ -141,7 +141,7 @@ def _lamp_on_skin(scene: TissueScene, grid: SheetGrid, cells: _Cells, i: mi.UInt
         inv2 = dr.rcp(dr.squared_norm(to))
         to *= dr.sqrt(inv2)
         dark = hidden | (dr.dot(to, cells.normal) <= 0)
-        flux += dr.select(dark, 0, lamp.radiant_intensity(-to) * inv2) * to
+        flux += dr.select(dark, 0, lamp.radiant_intensity(-to) * inv2 * lamp.shade(cells.x, source)) * to
         free += dr.select(hidden, 0, 1)
         k += 1
     share = dr.rcp(dr.maximum(mi.Float(count), 1))

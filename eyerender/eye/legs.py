@@ -12,14 +12,15 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Statuses
 from ..base.status import Status
-from ..eye.batch import take_eyes
-from ..eye.model import EyeModel
-from ..eye.worn import Choice, Course, WornLens, choices, more_telling, reachable_by
-from ..optics.shooting import connect
-from ..optics.solve import joined_rays, mirroring, refracted_rays, refracting_path
+from ..optics.interface import minus, unit
+from ..optics.shooting import connect, taken
+from ..optics.solve import Rays, joined_rays, mirroring, refracted_rays, refracting_path
 from ..optics.surfaces import Xyz, components, join, shift, turn
 from ..optics.trace import Crossing, each
+from .model import EyeModel
+from .worn import Choice, Course, WornLens, choices, more_telling, reachable_by
 
+_AT_APEX = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 _SEEDS = 5
 _SAME_MM = 1e-6
 """Mirror points of one surface closer than this are one."""
@@ -52,15 +53,43 @@ def refracted_legs(eye: EyeModel, lenses: Sequence[WornLens], target: Xyz, viewp
     if not lenses:
         rays = refracted_rays(eye.front, eye.front_indices, target, viewpoint, rim_mm=eye.limbus_radius_mm)
         return Leg(rays.exit, rays.exit, rays.way, rays.end, rays.residual_mm, rays.status, _none(rays.status))
-    courses = [(choice, ()) for choice in choices(len(lenses))]
-    return _attempted(eye, lenses, courses, viewpoint, target, mirrors=False)
+    middle = refracting_path(eye.front, eye.front_indices, eye.limbus_radius_mm)
+    return _attempted(middle, lenses, [(choice, ()) for choice in choices(len(lenses))], viewpoint, target)
 
 
 def mirrored_legs(eye: EyeModel, lenses: Sequence[WornLens], lights: Xyz, viewpoint: Xyz) -> Leg:
     """Compute rays from the camera by way of the cornea to lamps (n, m), each leg past the lenses."""
-    every = choices(len(lenses))
-    courses = sorted(((c, l) for c in every for l in every), key=lambda pair: -len(pair[0]) - len(pair[1]))
-    return _attempted(eye, lenses, courses, viewpoint, lights, mirrors=True)
+    return _attempted((mirror_of(eye),), lenses, both_legs(len(lenses)), viewpoint, lights)
+
+
+def air_legs(lenses: Sequence[WornLens], target: Xyz, viewpoint: Xyz, *, thorough: bool = True) -> Leg:
+    """Compute rays from the camera past lenses to points in front of the eye, (n, k); `exit` is the point itself."""
+    courses = [(choice, ()) for choice in choices(len(lenses))]
+    return _attempted((), lenses, courses, viewpoint, target, thorough=thorough)
+
+
+def mirror_of(eye: EyeModel) -> Crossing:
+    """Return the reflection at the cornea of an eye."""
+    return mirroring(eye.front[0], eye.limbus_radius_mm)
+
+
+def both_legs(count: int) -> list[tuple[Choice, Choice]]:
+    """Return the choices of lenses for the legs of camera and lamp, those with most lenses first."""
+    every = choices(count)
+    return sorted(product(every, every), key=lambda pair: -len(pair[0]) - len(pair[1]))
+
+
+def apparent_places(lenses: Sequence[WornLens], points_mm: Floats) -> Floats:
+    """Compute where points (n, 3) appear from the eye's apex behind lenses: nearest to the rays to three points there.
+
+    Points without a ray stay where they are. Lenses and points are in one frame, the eye's or the unrotated eye's.
+    """
+    target = components(_AT_APEX[None])
+    seen = [air_legs([lens.take(None) for lens in lenses], target, components(p[None, None])) for p in points_mm]
+    ways = np.stack([join(leg.way)[0] for leg in seen])
+    across = np.eye(3) - ways[..., :, None] * ways[..., None, :]
+    found = np.linalg.solve(across.sum(axis=1), np.einsum("npij,pj->ni", across, _AT_APEX)[..., None])[..., 0]
+    return np.where(np.isfinite(found), found, points_mm)
 
 
 def _none(status: Statuses) -> Indices:
@@ -68,31 +97,29 @@ def _none(status: Statuses) -> Indices:
 
 
 def _attempted(
-    eye: EyeModel,
+    middle: Sequence[Crossing],
     lenses: Sequence[WornLens],
     courses: Sequence[tuple[Choice, Choice]],
     viewpoint: Xyz,
     target: Xyz,
     *,
-    mirrors: bool,
+    thorough: bool = True,
 ) -> Leg:
-    """Solve for the first course (lenses of the camera's leg, of the lamp's leg) that each ray can take."""
+    """Solve for the first course (lenses of the camera's leg, of the lamp's leg) that each ray (n, k) can take."""
     shape = np.broadcast_shapes(*(axis.shape for axis in (*viewpoint, *target)))
     viewpoint, target = (each(lambda axis: np.broadcast_to(axis, shape), point) for point in (viewpoint, target))
     nothing = (np.full(shape, np.nan),) * 3
-    whole = Leg(
-        nothing, nothing, nothing, nothing, nothing[0], np.full(shape, Status.NONE, np.int8), np.full(shape, -1)
-    )
+    status, passed = np.full(shape, Status.NONE, np.int8), np.full(shape, -1)
+    whole = Leg(nothing, nothing, nothing, nothing, nothing[0], status, passed)
     for number, (before, after) in enumerate(courses):
-        may = reachable_by(lenses, before, viewpoint) & (whole.status != Status.OK)
-        if mirrors:
-            may &= reachable_by(lenses, after, target)
+        may = reachable_by(lenses, before, viewpoint, None if middle else target) & reachable_by(lenses, after, target)
+        may &= whole.status != Status.OK
         rows = np.flatnonzero(may.any(axis=1))
         if not len(rows):
             continue
-        some, near = take_eyes(eye, rows), [lens.take(rows) for lens in lenses]
-        ends = (_rows_of(point, rows) for point in (viewpoint, target))
-        found = _one_course(some, near, (before[::-1], after), *ends, mirrors=mirrors)
+        some, near = [taken(crossing, rows) for crossing in middle], [lens.take(rows) for lens in lenses]
+        course = Course.of(near, before[::-1], some, after)
+        found = _one_course(course, _rows_of(viewpoint, rows), _rows_of(target, rows), thorough)
         good = may[rows] & (found.status == Status.OK)
         status = np.where(may[rows], more_telling(whole.status[rows], found.status), whole.status[rows])
         found = found._replace(passed=np.full(good.shape, number), status=np.where(good, np.int8(Status.OK), status))
@@ -113,25 +140,18 @@ def _placed(rows: Indices, good: Bools, old: Floats, new: Floats) -> Floats:
     return out
 
 
-def _one_course(
-    eye: EyeModel,
-    lenses: Sequence[WornLens],
-    passed: tuple[Choice, Choice],
-    viewpoint: Xyz,
-    target: Xyz,
-    *,
-    mirrors: bool,
-) -> Leg:
+def _one_course(course: Course, viewpoint: Xyz, target: Xyz, thorough: bool) -> Leg:
     """Solve for the rays of one course, and check them."""
-    middle = refracting_path(eye.front, eye.front_indices, eye.limbus_radius_mm)
-    if mirrors:
-        middle = (mirroring(eye.front[0], eye.limbus_radius_mm),)
-    course = Course.of(lenses, passed[0], middle, passed[1])
-    cornea = course.first_of_eye
-    rays = joined_rays(course.path, 1.0, viewpoint, target, cornea)
+    eye = course.first_of_eye
+    if not course.path:
+        gap = unit(minus(target, viewpoint))
+        rays = Rays(target, gap, gap, np.zeros(gap[0].shape), np.zeros(gap[0].shape, np.int8))
+    else:
+        rays = joined_rays(course.path, 1.0, viewpoint, target, 0 if eye is None else eye, thorough=thorough)
     traced, status = course.follow(viewpoint, rays.way, target)
     status = np.where(rays.status == Status.OK, status, rays.status).astype(np.int8)
-    exit, way = components(traced.points_mm[cornea + 1]), components(traced.directions[cornea])
+    exit = target if eye is None else components(traced.points_mm[eye + 1])
+    way = components(traced.directions[-1 if eye is None else eye])
     return Leg(rays.exit, exit, way, rays.end, rays.residual_mm, status, _none(status))
 
 
@@ -143,50 +163,66 @@ class LensImage:
         lamp: number of the lamp.
         surface: front or back.
         index: number of the image in this surface; further lenses go on counting.
-        seen_mm: (3,) the last point on the way to the camera; NaN where the status is not OK.
+        status: of the image; the numbers below are NaN where it is not OK.
+        seen_mm: (3,) the last point on the way to the camera.
+        mirror_mm: (3,) the mirror point.
+        leaving: (3,) unit direction in which the light leaves the lamp.
+        share: share of the light that arrives.
+        cross_section_mm2_sr: cross section of the ray tube at the lamp per solid angle at the camera.
         residual_mm: miss distance.
-        status: of the image.
     """
 
     lamp: int
     surface: str
     index: int
-    seen_mm: Floats
-    residual_mm: float
     status: Status
+    seen_mm: Floats
+    mirror_mm: Floats
+    leaving: Floats
+    share: float = np.nan
+    cross_section_mm2_sr: float = np.nan
+    residual_mm: float = np.nan
 
 
-def lens_images(lenses: Sequence[WornLens], lamps_mm: Floats, camera_mm: Floats) -> list[LensImage]:
+def lens_images(
+    lenses: Sequence[WornLens], lamps_mm: Floats, camera_mm: Floats, near_mm: Floats | None = None
+) -> list[LensImage]:
     """Compute the reflections of lamps (m, 3) in both surfaces of lenses, seen from a camera (3,), in the head's frame.
 
     Every surface is searched from a grid of points inside the outline, because it may show several images of a lamp, or
     none. What hides them (the eye, the face) is not considered.
+
+    Args:
+        lenses: the lenses, in order from the eye.
+        lamps_mm: the lamps.
+        camera_mm: the camera.
+        near_mm: (p, 3) where mirror points are searched, in place of the grid.
     """
-    out = []
+    out: list[LensImage] = []
     for surface in ("front", "back"):
-        images: list[list[tuple[Floats, float]]] = [[] for _ in lamps_mm]
+        images: list[list[LensImage]] = [[] for _ in lamps_mm]
         for k in range(len(lenses)):
-            _add_images(images, lenses, k, surface, lamps_mm, camera_mm)
+            _add_images(images, lenses, k, surface, (lamps_mm, camera_mm, near_mm))
         for lamp, own in enumerate(images):
-            status = Status.OK if own else Status.NO_MIRROR_POINT
-            out += [
-                LensImage(lamp=lamp, surface=surface, index=index, seen_mm=seen, residual_mm=residual, status=status)
-                for index, (seen, residual) in enumerate(own or [(np.full(3, np.nan), np.nan)])
-            ]
+            nothing = np.full(3, np.nan)
+            none = LensImage(
+                lamp=lamp, surface=surface, index=0, status=Status.NO_MIRROR_POINT,
+                seen_mm=nothing, mirror_mm=nothing, leaving=nothing,
+            )  # fmt: skip
+            out += own or [none]
     return sorted(out, key=lambda one: one.lamp)
 
 
 def _add_images(
-    images: list[list[tuple[Floats, float]]],
+    images: list[list[LensImage]],
     lenses: Sequence[WornLens],
     number: int,
     surface: str,
-    lamps_mm: Floats,
-    camera_mm: Floats,
+    ends: tuple[Floats, Floats, Floats | None],
 ) -> None:
-    """Append the images of each lamp in one surface of one lens: the point that the camera sees, and the residual."""
-    lens, camera = lenses[number], components(camera_mm)
-    lamps: Xyz = components(lamps_mm[:, None])
+    """Append the images of each lamp in one surface of one lens; `ends` are lamps, camera and places to search."""
+    lens, (lamps_mm, camera_mm, near_mm) = lenses[number], ends
+    camera, lamps = components(camera_mm), components(lamps_mm[:, None])
     outside = bool(lens.faces(camera))
     beside = lens.faces(lamps)[:, 0] != outside
     first, second = lens.inward() if outside else lens.outward()
@@ -197,8 +233,7 @@ def _add_images(
     if mirror.surface is second.surface:
         middle = (first, mirror, (lens.outward() if outside else lens.inward())[1])
     between = range(number + 1, len(lenses)) if outside else range(number)
-    seeds = _seeds(lens, mirror)
-    known: list[list[Floats]] = [[] for _ in lamps_mm]
+    seeds = _seeds(lens, mirror) if near_mm is None else components(near_mm)
     for before, after in product(choices(len(between)), repeat=2):
         there = sorted((between[k] for k in before), reverse=outside)
         back = sorted((between[k] for k in after), reverse=not outside)
@@ -207,11 +242,16 @@ def _add_images(
         start = components(np.broadcast_to(camera_mm, (*shot.status.shape, 3)))
         traced, status = course.follow(start, shot.start, lamps)
         good = (shot.status == Status.OK) & (status == Status.OK) & ~beside[:, None]
-        points = join(shot.turning)
+        points, leaving, share = join(shot.turning), -join(shot.end), course.share(traced)
         for i, k in np.argwhere(good).tolist():
-            if all(np.linalg.norm(points[i, k] - other) >= _SAME_MM for other in known[i]):
-                known[i].append(points[i, k])
-                images[i].append((traced.points_mm[1, i, k], float(shot.residual_mm[i, k])))
+            if all(np.linalg.norm(points[i, k] - other.mirror_mm) >= _SAME_MM for other in images[i]):
+                one = LensImage(
+                    lamp=i, surface=surface, index=len(images[i]), status=Status.OK,
+                    seen_mm=traced.points_mm[1, i, k], mirror_mm=points[i, k], leaving=leaving[i, k],
+                    share=float(share[i, k]), cross_section_mm2_sr=abs(float(shot.determinant_mm2_sr[i, k])),
+                    residual_mm=float(shot.residual_mm[i, k]),
+                )  # fmt: skip
+                images[i].append(one)
 
 
 def _seeds(lens: WornLens, mirror: Crossing) -> Xyz:

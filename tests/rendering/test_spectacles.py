@@ -1,0 +1,206 @@
+"""Pictures of eyes behind spectacles, against ray optics in double precision and closed forms."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from eyerender.analytic.observer import trace
+from eyerender.cli.main import main
+from eyerender.eye.legs import refracted_legs
+from eyerender.eye.worn import Course
+from eyerender.imaging.capture import check_windows, render_job
+from eyerender.imaging.images import render
+from eyerender.optics.interface import fresnel
+from eyerender.optics.shooting import ray_tube
+from eyerender.optics.solve import refracting_path
+from eyerender.optics.surfaces import components, join
+from eyerender.rendering.glints.splatting import MirrorImages
+from eyerender.scene import Scene
+from eyerender.scene.parts import PUPIL
+from eyerender.scene.spec import SceneSpec
+
+EVEN = {"iris_contrast": 0.0, "limbal_ring": 0.0, "iris": {"relief": 0.0}, "pupil_albedo": 0.0}
+
+
+def scene(spectacles=None, **more):
+    spec = {
+        "format": 2,
+        "name": "glasses",
+        "eye": {"model": "E2", "pupil_diameter_mm": 4.0},
+        "subject": {"eyes": ["right"], **({} if spectacles is None else {"spectacles": spectacles})},
+        "rig": {
+            "cameras": [{"position_mm": [45, -45, -20], "look_at_mm": [-3, -31.5, 0], "focal_length_px": 720,
+                         "resolution_px": [320, 240], "principal_point_px": [160, 120]}],
+            "lights": [{"position_mm": [48, -20, -14], "aim_mm": [0, -31.5, 0], "intensity_mw_sr": 0.5}],
+        },
+        "poses": [{"azimuth_deg": 6.0, "elevation_deg": 3.0}],
+        "image": {"spp": 64},
+    } | more  # fmt: skip
+    return Scene.of(SceneSpec.from_mapping(spec))
+
+
+NOTHING = {
+    "surfaces": {"front_radius_mm": 80.0, "back_radius_mm": 60.0, "thickness_mm": 2.0, "index": 1.0},
+    "reflectance": 0.0,
+}
+
+
+@pytest.mark.parametrize("region", [None, {"seed": 3}])
+def test_a_lens_of_index_1_changes_no_pixel_by_more_than_a_code(region):
+    """It is traced, and rounds in single precision: at most one 8-bit code, in at most 0.1 % of the pixels."""
+    settings = {"region": region, "image": {"spp": 16}}
+    bare, worn = (render(scene(lens, **settings).frames()[0]) for lens in (None, NOTHING))
+    gap = np.abs(bare.irradiance - worn.irradiance) / bare.irradiance.max()
+    assert (gap < 1 / 255).mean() > 0.999
+    assert np.sqrt(np.mean(gap**2)) < 5e-4
+    assert (bare.parts != worn.parts).mean() < 1e-3
+    assert bare.rendered.failed_paths == worn.rendered.failed_paths == 0
+
+
+@pytest.mark.parametrize("power", [-6.0, 5.0])
+def test_the_pupil_of_the_picture_is_that_of_ray_optics(power):
+    """The centre of the mask within .1 px (it has 1,500 whole pixels), and its area, against the traced outline."""
+    worn = scene({"sphere_d": power, "cylinder_d": -1.5, "axis_deg": 30.0})
+    image, truth = render(worn.frames()[0]), trace(worn)
+    v, u = np.nonzero(image.parts == PUPIL)
+    centre = np.array([u.mean() + image.window[0], v.mean() + image.window[1]])
+    bare = trace(scene())
+    assert np.linalg.norm(truth.pupil.centre_px[0] - bare.pupil.centre_px[0]) > 2.0
+    points = truth.pupil.points_px[0]
+    area = 0.5 * abs(np.sum(points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)))
+    assert np.linalg.norm(centre - truth.pupil.centre_px[0]) < 0.1
+    # 30 chords cut 0.7 % off an ellipse.
+    assert len(u) == pytest.approx(area / (np.sin(2 * np.pi / 30) / (2 * np.pi / 30)), rel=3e-3)
+
+
+def energy_at_iris(worn, frames, point):
+    """Irradiance of a point of the iris' plane, and the share of its radiance that arrives, in double precision."""
+    job = render_job(frames, 0)
+    eye, lenses = job.eye, job.turned_lenses
+    lamp = job.lights[0]
+    source, camera = ((p - job.t) @ job.M for p in (lamp.position_mm, job.camera.nodal_point_mm))
+    middle = refracting_path(eye.front, eye.front_indices, eye.limbus_radius_mm)
+    batch = [lens.take(None) for lens in lenses]
+    out = []
+    for end in (source, camera):
+        legs = refracted_legs(eye, batch, components(point[None, None]), components(end[None, None]))
+        course = Course.of(batch, (0,) if lenses else (), middle)
+        way = join(legs.seen)[0, 0] - end
+        way /= np.linalg.norm(way)
+        start, goal = components(end[None, None]), components(point[None, None])
+        traced, _ = course.follow(start, components(way[None, None]), goal)
+        tube = ray_tube(course.path, 1.0, start, components(way[None, None]), goal)
+        k = course.first_of_eye
+        normal = eye.front[0].normal(traced.points_mm[k + 1, 0, 0])
+        cosine = -float(normal @ traced.directions[k, 0, 0])
+        film = float(fresnel(cosine, 1.0, float(eye.front_indices[0]), job.film_index).unpolarized)
+        share = float(course.share(traced)[0, 0]) * (1 - film)
+        leaving = way @ (job.M.T @ lamp.axis)
+        facing = -float(join(tube.end)[0, 0] @ eye.stop.normal)
+        out.append((share, leaving, facing / float(tube.cross_section_mm2_sr[0, 0]), join(legs.seen)[0, 0]))
+    (lit, leaving, density, _), (passed, _, _, seen) = out
+    xy, _ = job.camera.project(seen @ job.M.T + job.t)
+    return lit * max(leaving, 0) ** lamp.lobe_exponent * density * passed, xy
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"sphere_d": -6.0},
+        {"sphere_d": 6.0, "material": "1.67"},
+        {"sphere_d": 1.0, "cylinder_d": -2.0, "axis_deg": 70.0, "reflectance": [0.2, 0.1], "transmission": 0.9},
+        {"surfaces": {"front_radius_mm": None, "back_radius_mm": None, "thickness_mm": 3.0, "index": 1.6}},
+    ],
+)
+def test_the_iris_is_as_bright_as_its_light_paths_say(lens):
+    """Up to four interfaces on the way in and out; ratios to the bare eye, where the renderer is proved elsewhere.
+
+    The renderer takes a coating's reflectance at normal incidence times Fresnel's fall-off: .5 % at 30 degrees.
+    """
+    settings = {"look": EVEN | {"tear_film": False}, "image": {"spp": 256, "interreflection": False}}
+    pictures = {}
+    for name, worn in (("bare", None), ("worn", lens)):
+        one = scene(worn, **settings)
+        frames = one.frames()
+        image = render(frames[0]).irradiance
+        rows = []
+        for angle in np.radians([20, 110, 160, 200, 290, 340]):
+            stop = one.eye("right").stop
+            point = stop.centre_mm + 3.6 * (np.cos(angle) * stop.rotation[:, 1] + np.sin(angle) * stop.rotation[:, 2])
+            wanted, (x, y) = energy_at_iris(one, frames, point)
+            i, j = int(np.floor(y)), int(np.floor(x))
+            a, b = y - i, x - j
+            found = (1 - a) * ((1 - b) * image[i, j] + b * image[i, j + 1])
+            found += a * ((1 - b) * image[i + 1, j] + b * image[i + 1, j + 1])
+            camera = one.rig.cameras[0]
+            falloff = (camera.rays(np.array([x, y])) @ camera.axis) ** 4
+            rows.append(found / falloff / wanted)
+        pictures[name] = np.array(rows)
+    assert np.abs(pictures["worn"] / pictures["bare"] - 1).max() < 0.01
+    assert abs(np.mean(pictures["worn"] / pictures["bare"]) - 1) < 0.005
+
+
+def test_a_lens_reflection_has_the_energy_of_the_mirror_formula():
+    """On the axis of a convex mirror: E = R I / (d_L + d_C + 2 d_L d_C / r)^2."""
+    r, index = 85.0, 1.5
+    made = {"front_radius_mm": r, "back_radius_mm": 90.0, "thickness_mm": 6.0, "index": index}
+    lens = {"surfaces": made, "pantoscopic_deg": 0.0, "wrap_deg": 0.0}
+    lights = [{"position_mm": [600, -31.2, 0], "aim_mm": [0, -31.5, 0], "intensity_mw_sr": 3.0, "lobe_exponent": 0.0}]
+    camera = {"position_mm": [500, -31.5, 0.3], "look_at_mm": [0, -31.5, 0.3], "focal_length_px": 4000,
+              "resolution_px": [640, 480]}  # fmt: skip
+    worn = scene(lens, rig={"cameras": [camera], "lights": lights})
+    job = render_job(worn.frames(), 0)
+    images = MirrorImages.of(job, None).in_lenses
+    front = images[0]
+    d_l, d_c, reflectance = 600.0 - 19.0, 500.0 - 19.0, ((index - 1) / (index + 1)) ** 2
+    wanted = reflectance * 3.0 / (d_l + d_c + 2 * d_l * d_c / r) ** 2
+    # An image has energy E f_x f_y / cos^3, radiance times pixels.
+    assert front.energy.sum() / 4000.0**2 == pytest.approx(wanted, rel=0.01)
+    seen = trace(worn).lens_glints
+    assert np.abs(front.xy_px[0] - seen.xy_px[0, 0]).max() < 0.002
+    assert len(images) == 2
+
+
+def test_reflections_of_lenses_saturate_where_ray_optics_puts_them():
+    worn = scene({"sphere_d": -2.0}, sensor={"exposure_ms": 5.0})
+    image, places = render(worn.frames()[0]), trace(worn).lens_glints
+    counts = image.counts.astype(float)
+    inside = places.in_image[0] & (places.status[0] == 0)
+    assert inside.any()
+    for x, y in places.xy_px[0, inside]:
+        assert counts[round(y), round(x)] > 0.98 * counts.max()
+
+
+def test_the_edge_of_a_lens_is_dark_and_beside_it_the_eye_is_bare():
+    lens = {"sphere_d": -8.0, "outline_mm": [20.0, 2.0], "reflectance": 0.0, "vertex_mm": 12.0}
+    bare, worn = (render(scene(one).frames()[0]).irradiance for one in (None, lens))
+    same = np.abs(worn / bare - 1) < 1e-3
+    assert same[120:].all()  # beside the lens
+    assert same[:24].mean() < 0.2  # through it
+    dark = (worn < 0.05 * bare).any(axis=0)
+    assert dark.mean() > 0.8  # its edge crosses most columns
+
+
+def test_the_command_renders_and_validates(tmp_path):
+    file = tmp_path / "worn.yaml"
+    settings = {"image": {"spp": 8}, "region": {"seed": 2}}
+    lens = [
+        {"sphere_d": -3.0, "axis_deg": 10.0, "cylinder_d": -1.0},
+        {"sphere_d": 0.0, "vertex_mm": 20.0, "mount": "rig"},
+    ]
+    file.write_text(scene(lens, **settings).spec.to_yaml())
+    for command in (["render", str(file), "-o", str(tmp_path / "out")], ["validate", str(tmp_path / "out")]):
+        with pytest.raises(SystemExit) as end:
+            main(command)
+        assert not end.value.code
+    line = json.loads((tmp_path / "out" / "metadata.jsonl").read_text().splitlines()[0])
+    assert [one["sphere_d"] for one in json.loads(line["parameters"]["spectacles"])] == [-3.0, 0.0]
+    assert line["records"][0]["lens_glints"]
+
+
+def test_meshed_eyes_with_spectacles_are_refused():
+    with pytest.raises(Exception, match="meshes of the eye are rendered without spectacles so far"):
+        check_windows(scene({"sphere_d": -1.0}, image={"surfaces": "mesh"}))
