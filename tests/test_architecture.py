@@ -365,7 +365,7 @@ def test_what_reproduces_a_papers_software_stays_in_the_studies():
     core = [p for p in modules() if room(p) != "cli" and "study" not in p.parts]
     found = [p.name for p in core if re.search(rf"\b({switches})\b", p.read_text(encoding="utf-8"))]
     assert found == []
-    own = {"E1", "E2", "E3", "E4", "E5", "keratoconus"}
+    own = {"E1", "E2", "E3", "E4", "E5", "adult", "keratoconus"}
     assert {p.stem for p in (PACKAGE / "eye" / "catalogue").glob("*.yaml")} == own
     assert not list((PACKAGE / "report").rglob("*study*"))
 

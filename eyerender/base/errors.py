@@ -24,6 +24,10 @@ class UnfinishedRunWarning(UserWarning):
     """Only the finished shards of an unfinished run were read."""
 
 
+class FitWarning(UserWarning):
+    """The fit of an eye may be wrong: features and model disagree, or the features do not determine the gaze."""
+
+
 class EyerenderError(Exception):
     """Base of every error that this package raises on purpose: the run failed (disk, worker, backend).
 

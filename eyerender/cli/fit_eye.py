@@ -18,7 +18,7 @@ def fit_eye(
     output: OutputFolder,
     rig: str | None = None,
     unknowns: Path | None = None,
-    eye: str = "E2",
+    eye: str = "adult",
     columns: Path | None = None,
     targets: bool = True,
     robust: Literal["geman-mcclure", "huber", "none"] = "geman-mcclure",
@@ -31,13 +31,14 @@ def fit_eye(
 
     The folder receives one eye file per eye (right.yaml, left.yaml), which every other command accepts, and fit.json:
     gaze, pupil and slippage of every frame, the person's parameters with standard deviations, chi^2, and the parameters
-    that the recording does not determine.
+    that the recording does not determine. A fit that may be wrong gives a warning; one that leads to an eye that cannot
+    exist, or far from the priors, is refused.
 
     Args:
         recording: Records as `features` or `extract` write them (JSON, JSONL), or a table (CSV).
         rig: A rig file, or a scene for its rig and for places of eyes that the recording lacks (default: the rig in the
             recording).
-        unknowns: A YAML file with the keys of `er.Unknowns` (default: the priors of a population, 3 mm of slippage).
+        unknowns: A YAML file with the keys of `er.Unknowns` (default: the priors of people, 3 mm of slippage).
         eye: Start of the fit and mean of its priors: a catalogue name or an eye file.
         columns: A YAML file with the meaning of a table's columns.
         targets: Use the known targets, which determine the line of sight.
@@ -68,15 +69,13 @@ def _text(found: dict[str, Any], output: Path) -> str:
     for one in found["eyes"]:
         lines.append(f"{one['eye']} eye: {len(one['frames'])} frames, chi^2 {one['chi2']:.1f} "
                      f"for {one['degrees_of_freedom']} degrees of freedom")  # fmt: skip
-        lines.append(f"  {'change from the prior':<21} {'unit':<5} {'result':>23} {'prior':>12}")
+        lines.append(f"  {'change from the prior':<27} {'unit':<5} {'result':>23} {'prior':>12}")
         for name, value in one["person"].items():
             if value["deviation"] != 0.0:
                 before = "unknown" if value["prior_deviation"] is None else f"+- {value['prior_deviation']:.4g}"
                 spread = "" if value["deviation"] is None else f" +- {value['deviation']:<10.4g}"
                 cells = f"{value['unit']:<5} {value['change']:>+9.4f}{spread:<14} {before:>12}"
-                lines.append(f"  {name:<21} {cells}{'' if value['learned'] else '  not learned'}")
+                lines.append(f"  {name:<27} {cells}{'' if value['learned'] else '  not learned'}")
         if one["not_seen"]:
             lines.append(f"  not seen: {', '.join(one['not_seen'])}")
-        if one["file"] is None:
-            lines.append(f"  no eye file: {one['file_reason']}; give narrower priors with --unknowns")
     return "\n".join([*lines, f"written to {output}"])

@@ -14,7 +14,7 @@ from typing import Any
 
 from cyclopts import CycloptsError, ValidationError
 
-from ..base.errors import MAX_MESSAGE, EyerenderError, InputError, UnfinishedRunWarning, one_line
+from ..base.errors import MAX_MESSAGE, EyerenderError, FitWarning, InputError, UnfinishedRunWarning, one_line
 
 # Importing them registers their commands.
 from . import (  # noqa: F401
@@ -102,18 +102,19 @@ def _called(tokens: Sequence[str]) -> Any:
 
 @contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Print warnings about unfinished runs as single lines, like other warnings of a command."""
+    """Print warnings about unfinished runs and doubtful fits as single lines, like other warnings of a command."""
     with warnings.catch_warnings():
         before = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
-            if issubclass(category, UnfinishedRunWarning):
+            if issubclass(category, (UnfinishedRunWarning, FitWarning)):
                 print(f"warning: {one_line(str(message), MAX_MESSAGE)}", file=sys.stderr)
             else:
                 before(message, category, *place)
 
         warnings.showwarning = show  # type: ignore[assignment]
         warnings.simplefilter("always", UnfinishedRunWarning)
+        warnings.simplefilter("always", FitWarning)
         yield
 
 

@@ -90,7 +90,7 @@ def noise_of_some(scene: Scene, count: int) -> FeatureNoise:
 
 
 def site_matrices(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
-    """Compute information in each of n views: (n, 23, 23) of the outline and (m, n, 23, 23) of each LED's glint."""
+    """Compute information in each of n views: (n, 35, 35) of the outline and (m, n, 35, 35) of each LED's glint."""
     across, glints = whitened_slopes(slopes, noise, camera)
     glints = np.moveaxis(glints, 1, 0)
     return np.swapaxes(across, -1, -2) @ across, np.swapaxes(glints, -1, -2) @ glints
@@ -115,7 +115,7 @@ def choose_lights(known: SiteInformation, count: int) -> tuple[int, ...]:
 
     >>> known = er.design.site_information(er.load_scene("headset").frames())
     >>> er.design.choose_lights(known, 4)
-    (0, 2, 5, 7)
+    (0, 2, 5, 6)
 
     Args:
         known: information that each LED adds.

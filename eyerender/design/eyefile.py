@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,32 @@ import numpy as np
 from ..base.arrays import Floats
 from ..eye.kappa import angles_of, pupillary_axis, with_kappa
 from ..eye.spec import EyeSpec
-from .unknowns import ASPHERICITY, CENTRE, DEPTH, ELLIPTICITY, KAPPA, LOCAL, POSITION, RADIUS, ROTATION, SHIFT, TORICITY
+from .unknowns import (
+    ASPHERICITY,
+    CENTRE,
+    DEPTH,
+    ELLIPTICITY,
+    GAP,
+    HARMONICS,
+    KAPPA,
+    LOCAL,
+    MARGIN,
+    POSITION,
+    POSTERIOR,
+    POSTERIOR_TORICITY,
+    RADIUS,
+    ROTATION,
+    SHIFT,
+    TORICITY,
+)
 
 
 def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
-    """Return the eye file with the person's part of `theta` (23,) applied; the position has no key in it.
+    """Return the eye file with the person's part of `theta` (35,) applied; the position has no key in it.
 
-    The pupil's ellipticity becomes the second harmonic of its contour, which is right to first order. The fovea is
-    placed so that the line of sight keeps its direction in the eye, turned by kappa.
+    The pupil's ellipticity becomes the second harmonic of its contour, which is right to first order. The lens moves
+    with the pupil, which rests on it. The fovea is placed so that the line of sight keeps its direction in the eye,
+    turned by kappa.
 
     Raises:
         InputError: the eye is physically impossible.
@@ -26,15 +45,21 @@ def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
     data = spec.to_mapping()
     front = data["cornea"][0]["shape"]
     own = float(front["radius_mm"] if "radius_mm" in front else np.mean(front["radii_mm"]))
-    for surface in data["cornea"]:
-        _scale(surface["shape"], (own + theta[RADIUS]) / own)
-    data["cornea"][0]["shape"] = _flattened(data["cornea"][0]["shape"], float(theta[ASPHERICITY]))
-    if np.any(theta[TORICITY]):
-        _make_toric(data["cornea"][0], *theta[TORICITY])
+    for k, surface in enumerate(data["cornea"]):
+        _scale(surface["shape"], (own + theta[RADIUS]) / own * (1.0 + theta[POSTERIOR] * (k > 0)))
+        if k == 0:
+            surface["shape"] = _flattened(surface["shape"], float(theta[ASPHERICITY]))
+        toricity = theta[POSTERIOR_TORICITY if k else TORICITY]
+        if np.any(toricity):
+            _make_toric(surface, *toricity)
     data["stop"] = _changed_stop(data["stop"], theta)
-    for key in ("azimuth_centre_mm", "elevation_centre_mm"):
-        x, y, z = data["rotation"][key]
-        data["rotation"][key] = [x - theta[ROTATION], y, z]
+    lens = data.get("lens") or {}
+    for part in (*lens.get("surfaces", ()), *(lens[key] for key in ("front", "back") if key in lens)):
+        part["position_mm"] = _deeper(part["position_mm"], theta[DEPTH])
+    if lens.get("centre_mm"):
+        lens["centre_mm"] = _deeper(lens["centre_mm"], theta[DEPTH])
+    for key, half in (("azimuth_centre_mm", 0.5), ("elevation_centre_mm", -0.5)):
+        data["rotation"][key] = _deeper(data["rotation"][key], theta[ROTATION] + half * theta[GAP])
     changed = EyeSpec.from_mapping({**data, "name": f"{spec.name}, fitted"})
     eye, before = changed.build(), spec.build()
     wanted = angles_of(before, before.chief_ray.direction) + theta[KAPPA] - angles_of(eye, pupillary_axis(eye)[1])
@@ -42,19 +67,29 @@ def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
     return with_kappa(changed, (float(nasal), float(up)))
 
 
+def _deeper(place_mm: Sequence[float], by_mm: float) -> list[float]:
+    """Move a place (x, y, z) of the eye frame backwards."""
+    x, y, z = place_mm
+    return [x - float(by_mm), y, z]
+
+
 def _changed_stop(stop: dict[str, Any], theta: Floats) -> dict[str, Any]:
     (x, y, z), moves = stop["position_mm"], stop.get("shift_mm_per_mm", (0.0, 0.0))
     nasal, up = theta[CENTRE]
     stop = {
         **stop,
-        "position_mm": [x - theta[DEPTH], y + nasal, z + up],
+        "position_mm": _deeper((x, y + nasal, z + up), theta[DEPTH]),
         "shift_mm_per_mm": (np.array(moves) + theta[SHIFT]).tolist(),
     }
-    if np.any(theta[ELLIPTICITY]):
+    if np.any(theta[ELLIPTICITY]) or np.any(theta[MARGIN]):
         own = stop.get("contour") or {"cosines": (), "sines": ()}
-        rows = {name: [*own[name], 0.0, 0.0][: max(2, len(own[name]))] for name in ("cosines", "sines")}
-        for row, change in zip(rows.values(), theta[ELLIPTICITY], strict=True):
-            row[1] += float(change)
+        rows = {}
+        for part, name in enumerate(("cosines", "sines")):
+            row = np.zeros(max(HARMONICS[-1], len(own[name])))
+            row[: len(own[name])] = own[name]
+            row[1] += theta[ELLIPTICITY][part]
+            row[np.array(HARMONICS) - 1] += theta[MARGIN][part::2]
+            rows[name] = row.tolist()
         stop["contour"] = rows
     return stop
 

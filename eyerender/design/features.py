@@ -168,8 +168,8 @@ class Residuals:
     Attributes:
         outline: (n, k) residuals of outlines.
         glints: (n, m, 2) residuals of glints.
-        outline_slopes: (n, k, 23) derivatives; empty if not requested.
-        glint_slopes: (n, m, 2, 23) derivatives.
+        outline_slopes: (n, k, 35) derivatives; empty if not requested.
+        glint_slopes: (n, m, 2, 35) derivatives.
         outline_size: (n,) number of independent distances that the model has too.
         glint_ok: (n, m) whether a glint is both observed and modelled.
     """
@@ -219,7 +219,7 @@ def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floa
 
     Args:
         model_px: (n, j, 2) points, evenly spaced in the parameter.
-        slopes: (n, j, 2, 23) their derivatives, or None.
+        slopes: (n, j, 2, 35) their derivatives, or None.
         observed_px: (n, k, 2).
     """
     count = model_px.shape[1]

@@ -8,17 +8,22 @@ the median of its kind if that is above 1. The weights w_b are 1 for t <= 3, and
 t^2))^2 (Geman and McClure with a flat core). While all blocks of an instant are far off, t is taken relative to their
 median, by a factor of at most 1000 in the first step and half as much in each following one. Steps are damped by
 Levenberg's rule. The normal equations are arrow-shaped: frames are coupled only through the person's unknowns.
+
+Each instant starts from the best of a grid of directions. Those that remain worse than most are started again from
+other directions, before the person is fitted and afterwards. If chi^2 exceeds its degrees of freedom, the noise was
+larger than stated: covariances are those of noise that is larger by the square root of their ratio (Birge 1932).
 """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from ..base.arrays import ArrayValue, Bools, Floats, Ints, finite_or_none
-from ..base.errors import InputError
+from ..base.errors import FitWarning, InputError
 from ..eye.catalogue import load_eye
 from ..eye.spec import EyeSpec
 from ..rig.rig import RigGeometry, RigLike
@@ -27,7 +32,7 @@ from .eyefile import changed_file
 from .features import MeasuredFeatures, Residuals, measured, residuals, sized
 from .information import EyeInformation, eye_information
 from .noise import FeatureNoise
-from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, LOCAL, PERSON, PUPIL, UNITS, Unknowns
+from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, KAPPA, LOCAL, NAMES, PERSON, PUPIL, UNITS, Unknowns
 from .varied import (
     Views,
     diameters_mm,
@@ -48,7 +53,10 @@ LEARNED = 0.9
 _STEPS, _SETTLED = 40, 1e-10
 _POINTS = 30
 _START_AZIMUTH, _START_ELEVATION = np.radians(np.linspace(-36, 36, 9)), np.radians(np.linspace(-24, 24, 7))
-_FAR_PX = 60.0
+_FAR_PX, _SHIFT_SHARE = 60.0, 0.1
+_STARTS, _START_STEPS, _APART_RAD, _WORSE = 3, 12, np.radians(15.0), 3.0
+MOST_CHI2, MOST_DEVIATIONS = 2.0, 5.0
+"""Largest chi^2 per degree of freedom without a warning, and distance from a prior's mean without a refusal."""
 _PUPIL_MM = (0.5, 9.5)
 _FIRST_SCALE = 1000.0
 _MOST_RAD, _STUCK, _RELATIVE, _TINY = 0.25, 1e12, 1e-10, 1e-16
@@ -66,9 +74,9 @@ class Problem:
         instants: one view for each of i instants.
         target_mm: (i, 3) known targets; NaN where there is none.
         fixation_rad: noise of fixation per axis.
-        centre: (i, 23) means of the priors.
-        precision: (23,) inverse variances of the priors.
-        free: (23,) which unknowns are fitted.
+        centre: (i, 35) means of the priors.
+        precision: (35,) inverse variances of the priors.
+        free: (35,) which unknowns are fitted.
         robust: the weights.
     """
 
@@ -88,6 +96,21 @@ class Problem:
         """Whether any unknown of the person is fitted."""
         return bool(self.free[LOCAL:].any())
 
+    def take(self, instants: Ints) -> Problem:
+        """Select instants."""
+        place = np.full(len(self.centre), -1)
+        place[instants] = np.arange(len(instants))
+        rows = np.flatnonzero(place[self.instant] >= 0)
+        return replace(
+            self,
+            views=self.views.take(rows),
+            seen=self.seen.take(rows),
+            instant=place[self.instant[rows]],
+            instants=self.instants.take(instants),
+            target_mm=self.target_mm[instants],
+            centre=self.centre[instants],
+        )
+
     @property
     def has_target(self) -> Bools:
         """Whether each instant has a known target, (i,)."""
@@ -102,7 +125,8 @@ class EyeFit(ArrayValue):
         eye: right or left.
         rows: (n,) rows of the observations.
         instant: (n,) instant of each row.
-        theta: (i, 23) unknowns of each instant (`design.unknowns`), rad and mm.
+        theta: (i, 35) unknowns of each instant (`design.unknowns`), rad and mm; those of the frame are NaN where its
+            slippage is more than 5 standard deviations of the prior, which no eye explains.
         origin_mm: (i, 3) where the line of sight leaves the cornea.
         direction: (i, 3) unit direction of the line of sight.
         known: covariances, and combinations that are not determined.
@@ -113,6 +137,7 @@ class EyeFit(ArrayValue):
         converged: (i,) whether the steps settled.
         prior: the eye at the start of the fit.
         unknowns: the priors of the unknowns.
+        targets: number of frames with a known target.
     """
 
     eye: str
@@ -129,15 +154,44 @@ class EyeFit(ArrayValue):
     converged: Bools
     prior: EyeSpec
     unknowns: Unknowns
+    targets: int
 
     @property
     def spec(self) -> EyeSpec:
         """Convert the fitted eye to an eye file.
 
         Raises:
-            InputError: the eye is physically impossible, for instance with a pupil behind the front of the lens.
+            InputError: the eye is physically impossible, for instance with a pupil in front of the cornea.
         """
         return changed_file(self.prior, self.theta[0])
+
+    @property
+    def chi2_per_degree(self) -> float:
+        """Compute chi^2 per degree of freedom; about 1 if the features are as good as stated and the model holds."""
+        return float(self.chi2.sum() / max(self.dof, 1))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Say in words why the fit may be wrong; empty if nothing suggests it."""
+        lost, slow = int(np.isnan(self.theta[:, 0]).sum()), int((~self.converged).sum())
+        out = []
+        if self.chi2_per_degree > MOST_CHI2:
+            out.append(
+                f"chi^2 is {self.chi2_per_degree:.3g} per degree of freedom: the features are worse than stated, or "
+                "the eye differs from the model"
+            )
+        if slow:
+            out.append(f"{slow} of {len(self.converged)} frames did not converge")
+        if lost:
+            out.append(
+                f"{lost} of {len(self.converged)} frames need an eye further from its place than the prior allows"
+            )
+        kappa = self.known.person_deviation[KAPPA.start - LOCAL : KAPPA.stop - LOCAL]
+        if self.targets and (kappa > LEARNED * self.unknowns.deviations()[KAPPA]).any():
+            out.append("the targets do not determine kappa, the angle between line of sight and optic axis")
+        if self.known.unseen:
+            out.append(f"the features do not determine {', '.join(self.known.unseen)}")
+        return tuple(out)
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to JSON values; angles in degrees.
@@ -152,6 +206,7 @@ class EyeFit(ArrayValue):
             "chi2": float(self.chi2.sum()),
             "degrees_of_freedom": self.dof,
             "converged": bool(self.converged.all()),
+            "warnings": list(self.doubts),
             "not_seen": list(self.known.unseen),
             "person": {
                 name: {
@@ -166,12 +221,13 @@ class EyeFit(ArrayValue):
             "frames": [
                 {
                     "rows": self.rows[self.instant == k].tolist(),
-                    "azimuth_deg": float(np.degrees(self.theta[k, AZIMUTH])),
-                    "elevation_deg": float(np.degrees(self.theta[k, ELEVATION])),
-                    "pupil_mm": float(self.theta[k, PUPIL]),
-                    "slippage_mm": self.theta[k, 3:6].tolist(),
-                    "origin_mm": self.origin_mm[k].tolist(),
-                    "direction": self.direction[k].tolist(),
+                    "converged": bool(self.converged[k]),
+                    "azimuth_deg": finite_or_none(np.degrees(self.theta[k, AZIMUTH])),
+                    "elevation_deg": finite_or_none(np.degrees(self.theta[k, ELEVATION])),
+                    "pupil_mm": finite_or_none(self.theta[k, PUPIL]),
+                    "slippage_mm": [finite_or_none(v) for v in self.theta[k, 3:6]],
+                    "origin_mm": [finite_or_none(v) for v in self.origin_mm[k]],
+                    "direction": [finite_or_none(v) for v in self.direction[k]],
                     "gaze_deviation_deg": finite_or_none(self.known.gaze_deg[k]),
                     "chi2": float(self.chi2[k]),
                 }
@@ -188,7 +244,7 @@ def fit_eye(
     rig: RigLike,
     unknowns: Unknowns | None = None,
     *,
-    prior: EyeSpec | str = "E2",
+    prior: EyeSpec | str = "adult",
     noise: FeatureNoise | None = None,
     targets: bool = True,
     robust: Robust = "geman-mcclure",
@@ -197,22 +253,26 @@ def fit_eye(
     """Fit the gaze of every frame, and the eye, to features; one fit for each observed eye.
 
     >>> scene = er.load_scene("guestrin2006")
-    >>> right, left = er.fit_eye(er.trace(scene), scene.rig, er.Unknowns(corneal_radius_mm=0.25))
-    >>> right.eye, right.dof > 0
-    ('right', True)
+    >>> right, left = er.fit_eye(er.trace(scene.frames()[:18]), scene.rig)
+    >>> right.eye, right.doubts
+    ('right', ())
 
     Args:
         observations: observations of any observer, or of a table, each with the approximate position of its eye.
         rig: the rig that observed them.
         unknowns: the fitted unknowns and their priors; default: `Unknowns.population()`.
-        prior: start of the fit, and mean of the person's priors.
+        prior: start of the fit, and mean of the person's priors; default: the mean eye of adults.
         noise: noise of features without covariance; default: 0.1 px for one px of outline, 0.05 px for a glint.
         targets: use the known targets, with the noise of fixation.
         robust: the weights against wrong features.
-        start: (i, 23) start of the unknowns, for one eye; default: a search.
+        start: (i, 35) start of the unknowns, for one eye; default: a search.
+
+    Warns:
+        FitWarning: the fit may be wrong, for one of the reasons in `EyeFit.doubts`.
 
     Raises:
-        InputError: there is nothing to fit, an eye has no position, or a feature lies a million pixels away.
+        InputError: there is nothing to fit, an eye has no position, a feature lies a million pixels away, or the
+            features lead to an eye that is physically impossible or 5 standard deviations from a prior.
     """
     pupils, glints = observations.pupil.centre_px, observations.glints.xy_px
     far = (np.abs(pupils) > _FARTHEST_PX).any(axis=-1) | (np.abs(glints) > _FARTHEST_PX).any(axis=(-2, -1))
@@ -224,15 +284,24 @@ def fit_eye(
     built = rig.build()
     noise = FeatureNoise.of(DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX, rig=built) if noise is None else noise
     options = Options(targets=targets, robust=robust, start=start)
-    return tuple(
+    fits = tuple(
         fit_one(observations, np.flatnonzero(observations.index.eye == eye), built, spec, unknowns, noise, options)
         for eye in np.unique(observations.index.eye)
     )
+    for fit in fits:
+        warn_of(fit, stacklevel=3)
+    return fits
+
+
+def warn_of(fit: EyeFit, *, stacklevel: int = 2) -> None:
+    """Issue a `FitWarning` for each of a fit's doubts."""
+    for doubt in fit.doubts:
+        warnings.warn(f"{fit.eye} eye: {doubt}", FitWarning, stacklevel=stacklevel)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """Options of a fit, see `fit_eye`; `person` (17,) fixes the person's unknowns instead of the prior."""
+    """Options of a fit, see `fit_eye`; `person` (29,) fixes the person's unknowns instead of the prior."""
 
     targets: bool = True
     robust: Robust = "geman-mcclure"
@@ -244,10 +313,10 @@ def instants_of(observations: Observations) -> Ints:
     """Number the instants (n,) of one eye; the k-th frames of all cameras of a fixation are one instant."""
     index = observations.index
     place = np.stack([index.head, index.fixation, index.camera], axis=-1)
-    turn = np.zeros(len(index), dtype=np.int64)
-    for row in np.unique(place, axis=0):
-        same = (place == row).all(axis=1)
-        turn[same] = np.arange(same.sum())
+    group = np.unique(place, axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(group, kind="stable")
+    turn = np.empty(len(group), dtype=np.int64)
+    turn[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
     keys = np.stack([index.head, index.fixation, turn], axis=-1)
     return np.asarray(np.unique(keys, axis=0, return_inverse=True)[1]).reshape(-1)
 
@@ -270,7 +339,31 @@ def fit_one(
     theta, converged = solve(problem, theta)
     if options.robust != "none" and (other := without_wrong_outlines(problem, theta)) is not None:
         theta, converged = solve(problem, other)
-    return _result(mine, rows, problem, (theta, converged), (spec, unknowns))
+    if options.start is None and (other := restarted(problem, theta)) is not None:
+        theta, converged = solve(problem, other)
+    _refuse_strange(problem, theta)
+    found = _result(mine, rows, problem, (theta, converged), (spec, unknowns))
+    if options.person is None:
+        try:
+            _ = found.spec
+        except InputError as error:
+            raise InputError(
+                f"the features lead to an eye that cannot exist ({error})", path=f"{found.eye} eye"
+            ) from None
+    return found
+
+
+def _refuse_strange(problem: Problem, theta: Floats) -> None:
+    """Raise `InputError` if a number of the person is further than `MOST_DEVIATIONS` from its prior's mean."""
+    off = np.abs(theta - problem.centre)[0] * np.sqrt(problem.precision)
+    off[:LOCAL] = 0.0
+    worst = int(np.argmax(off))
+    if off[worst] > MOST_DEVIATIONS:
+        side = problem.views.eyes.side
+        raise InputError(
+            f"the features lead to a {NAMES[worst]} that is {off[worst]:.1f} standard deviations of its prior off; the "
+            "rig, the positions of the eyes or the priors are wrong", path=f"{side} eye",
+        )  # fmt: skip
 
 
 def problem_of(
@@ -316,26 +409,78 @@ def problem_of(
 
 
 def start_of(problem: Problem) -> Floats:
-    """Compute the start (i, 23): the best of a grid of directions for the pupil's centre and the glints."""
+    """Compute the start (i, 35): frames are fitted alone, from the best directions of a grid."""
+    theta = problem.centre.copy()
+    theta[:, [AZIMUTH, ELEVATION]] = directions_of(problem, theta)[0]
+    theta, _ = solve(_alone(problem), theta, _START_STEPS)
+    other = restarted(problem, theta)
+    return theta if other is None else other
+
+
+def _alone(problem: Problem) -> Problem:
+    """Return the same fit with a known person."""
+    return replace(problem, free=problem.free & (np.arange(COUNT) < LOCAL))
+
+
+def restarted(problem: Problem, theta: Floats) -> Floats | None:
+    """Fit instants that are worse than most again, from other directions of a grid; None if nothing improves."""
+    cost = badness(problem, theta)
+    worse = np.flatnonzero(cost > _WORSE * np.maximum(np.median(cost), 1.0))
+    if not len(worse):
+        return None
+    part, best = _alone(problem.take(worse)), theta[worse]
+    least = cost[worse]
+    for directions in directions_of(part, best):
+        trial = best.copy()
+        trial[:, PUPIL] = part.centre[:, PUPIL]
+        trial[:, 3:LOCAL] = 0.0
+        trial[:, [AZIMUTH, ELEVATION]] = directions
+        trial, _ = solve(part, trial, _START_STEPS)
+        now = badness(part, trial)
+        best = np.where((now < 0.9 * least)[:, None], trial, best)
+        least = np.minimum(now, least)
+    if np.array_equal(best, theta[worse]):
+        return None
+    out = theta.copy()
+    out[worse] = best
+    return out
+
+
+def badness(problem: Problem, theta: Floats) -> Floats:
+    """Sum the unexplained part of each instant's features and its distance from the priors, (i,)."""
+    off = (theta - problem.centre)[:, :LOCAL] ** 2 * problem.precision[:LOCAL]
+    return unexplained(problem, theta) + off.sum(axis=1)
+
+
+def directions_of(problem: Problem, theta: Floats) -> Floats:
+    """Search a grid for the best directions (3, i, 2) rad of each instant, 15 degrees apart, best first.
+
+    The misfit is that of the pupil's centre and the glints about their common shift, which counts less, since
+    slippage explains it.
+    """
     seen, n = problem.seen, len(problem.views)
-    azimuth, elevation = (a.ravel() for a in np.meshgrid(_START_AZIMUTH, _START_ELEVATION))
-    count = len(azimuth)
-    theta = np.tile(problem.centre[problem.instant], (count, 1))
-    theta[:, AZIMUTH], theta[:, ELEVATION] = np.repeat(azimuth, n), np.repeat(elevation, n)
-    images = images_of(problem.views.take(np.tile(np.arange(n), count)), theta, 6)
-    centre = images.outline_px.mean(axis=1).reshape(count, n, 2)
+    grid = np.stack([a.ravel() for a in np.meshgrid(_START_AZIMUTH, _START_ELEVATION)], axis=-1)
+    tried = np.tile(theta[problem.instant], (len(grid), 1))
+    tried[:, [AZIMUTH, ELEVATION]] = np.repeat(grid, n, axis=0)
+    images = images_of(problem.views.take(np.tile(np.arange(n), len(grid))), tried, 6)
     has: Bools = np.any(seen.outline_white, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         own = np.sum(seen.outline_px * has[..., None], axis=1) / has.sum(axis=1)[:, None]
-    gaps = [np.linalg.norm(centre - own, axis=-1)]
-    gaps += list(np.moveaxis(np.linalg.norm(images.glints_px.reshape(count, n, -1, 2) - seen.glints_px, axis=-1), 2, 0))
-    used = np.concatenate([np.any(has, axis=1)[None], seen.has_glint.T])
-    miss = np.minimum(np.nan_to_num(np.array(gaps), nan=_FAR_PX), _FAR_PX)
-    cost = np.zeros((count, len(problem.centre)))
-    np.add.at(cost.T, problem.instant, np.einsum("gcn,gn->nc", miss, used.astype(float)))
-    best = np.argmin(cost, axis=0)
-    out = problem.centre.copy()
-    out[:, AZIMUTH], out[:, ELEVATION] = azimuth[best], elevation[best]
+    seen_px = np.concatenate([own[:, None], np.where(seen.has_glint[..., None], seen.glints_px, np.nan)], axis=1)
+    centre = images.outline_px.mean(axis=1)[:, None]
+    gaps = np.concatenate([centre, images.glints_px], axis=1).reshape(len(grid), n, -1, 2) - seen_px
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # no feature at all in some direction
+        common = np.nan_to_num(np.nanmedian(gaps, axis=2), nan=_FAR_PX)
+    miss = np.minimum(np.nan_to_num(np.linalg.norm(gaps - common[:, :, None], axis=-1), nan=_FAR_PX), _FAR_PX)
+    used = np.concatenate([np.any(has, axis=1)[:, None], seen.has_glint], axis=1)
+    each = np.sum(miss * used, axis=2) + _SHIFT_SHARE * np.linalg.norm(common, axis=-1)
+    cost = np.zeros((len(grid), len(problem.centre)))
+    np.add.at(cost.T, problem.instant, each.T)
+    out = np.zeros((_STARTS, len(problem.centre), 2))
+    for start in out:
+        start[:] = grid[np.argmin(cost, axis=0)]
+        cost[np.linalg.norm(grid[:, None] - start, axis=-1) < _APART_RAD] = np.inf
     return out
 
 
@@ -410,7 +555,7 @@ def costs_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights
 
 
 def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Weights) -> tuple[Floats, Floats]:
-    """Compute the information (i, 23, 23) of each instant without priors, and half of the negative gradient (i, 23)."""
+    """Compute the information (i, 35, 35) of each instant without priors, and half of the negative gradient (i, 35)."""
     n = len(problem.views)
     roots = np.sqrt(weights.outline)[:, None], np.sqrt(weights.glints)[..., None]
     slopes = np.concatenate(
@@ -432,16 +577,16 @@ def equations_of(problem: Problem, theta: Floats, found: Residuals, weights: Wei
 
 
 def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, damping: Floats) -> Floats:
-    """Solve the arrow-shaped normal equations for the damped Gauss-Newton step (i, 23).
+    """Solve the arrow-shaped normal equations for the damped Gauss-Newton step (i, 35).
 
     With blocks A_i of the frames, B_i to the person and C of the person, the person's step is that of the Schur
     complement C - sum B_i^T A_i^-1 B_i, and A_i x_i = a_i - B_i y gives the frames'.
 
     Args:
         problem: the fit.
-        matrix: (i, 23, 23) information without priors.
-        vector: (i, 23) half of the negative gradient.
-        theta: (i, 23) current unknowns.
+        matrix: (i, 35, 35) information without priors.
+        vector: (i, 35) half of the negative gradient.
+        theta: (i, 35) current unknowns.
         damping: (i,) Levenberg's factors.
     """
     off = (problem.centre - theta) * problem.precision
@@ -468,7 +613,7 @@ def arrow_step(problem: Problem, matrix: Floats, vector: Floats, theta: Floats, 
 
 
 def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats, Bools]:
-    """Minimise equation (4) from `theta` (i, 23); return the unknowns, and which instants settled."""
+    """Minimise equation (4) from `theta` (i, 35); return the unknowns, and which instants settled."""
     theta, settled = theta.copy(), np.zeros(len(theta), dtype=bool)
     damping = np.full(len(theta), 1e-3)
     for count in range(steps):
@@ -483,9 +628,10 @@ def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats,
         theta = np.where(good[:, None], trial, theta)
         damping = np.where(good, damping / 10.0, damping * 10.0)
         settled |= (good & gain) | (np.abs(step).max(axis=1) < _SETTLED) | (damping > _STUCK)
-        in_core = (weights.outline == 1.0).all() and (weights.glints == 1.0).all()
-        if problem.robust != "none" and most > 1.0 and not in_core:
-            settled[:] = False
+        if problem.robust != "none" and most > 1.0:
+            outside = (weights.outline < 1.0) | (weights.glints < 1.0).any(axis=1)
+            settled[problem.instant[outside]] = False
+            settled &= settled.all() | (not problem.shared)
         if settled.all():
             break
     return theta, settled
@@ -500,26 +646,26 @@ def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:
     now = unexplained(problem, theta)
     if not (now > CORE**2).any():
         return None
-    alone = problem.free & (np.arange(COUNT) < LOCAL)
     seen = problem.seen
     blind = replace(seen, outline_white=0.0 * seen.outline_white, outline_size=0 * seen.outline_size)
-    other, _ = solve(replace(problem, free=alone, seen=blind), theta)
+    other, _ = solve(replace(_alone(problem), seen=blind), theta)
     better = unexplained(problem, other) < now - CORE
     return np.where(better[:, None], other, theta) if better.any() else None
 
 
 def unexplained(problem: Problem, theta: Floats) -> Floats:
-    """Sum the mean squared residuals of each instant's blocks, each at most CORE^2, (i,)."""
+    """Sum the mean squared residuals of each instant's blocks, each at most CORE^2, (i,); that for one not modelled."""
     found = residuals(problem.seen, images_of(problem.views, theta[problem.instant], _POINTS))
     outline, glints = block_sizes(found)
-    own = np.minimum(outline**2, CORE**2) + np.minimum(glints**2, CORE**2).sum(axis=1)
+    gone = (problem.seen.outline_size > found.outline_size) + (problem.seen.has_glint & ~found.glint_ok).sum(axis=1)
+    own = np.minimum(outline**2, CORE**2) + np.minimum(glints**2, CORE**2).sum(axis=1) + CORE**2 * gone
     out = np.zeros(len(theta))
     np.add.at(out, problem.instant, own)
     return out
 
 
 def _limited(problem: Problem, step: Floats) -> Floats:
-    """Shorten steps (i, 23) that would turn a direction by more than `_MOST_RAD`."""
+    """Shorten steps (i, 35) that would turn a direction by more than `_MOST_RAD`."""
     share = np.minimum(1.0, _MOST_RAD / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-12))
     return np.asarray(step * (share.min() if problem.shared else share[:, None]))
 
@@ -527,27 +673,34 @@ def _limited(problem: Problem, step: Floats) -> Floats:
 def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, weights: Weights) -> tuple[Bools, Bools]:
     """Return which instants (i,) a step does not worsen without losing features, and whether the gain is negligible.
 
-    If instants share a person, the result is the same for all.
+    An instant may lose half of its outlines and of its glints. If instants share a person, the result is the same for
+    all, and a quarter of them may lose more.
     """
     theta, found = now
     new = residuals(problem.seen, images_of(problem.views, trial[problem.instant], _POINTS))
     before, prior = costs_of(problem, theta, found, weights)
     after, prior_after = costs_of(problem, trial, _comparable(found, new), weights)
-    gone = 2 * new.glint_ok.sum(axis=1) < found.glint_ok.sum(axis=1)
-    gone |= new.outline_size < found.outline_size
-    lost = np.zeros(len(theta), dtype=bool)
-    np.logical_or.at(lost, problem.instant, gone)
+    kept = np.zeros((2, 2, len(theta)))
+    for at, one in enumerate((found, new)):
+        np.add.at(kept[at, 0], problem.instant, one.outline_size > 0)
+        np.add.at(kept[at, 1], problem.instant, one.glint_ok.sum(axis=1))
+    lost = np.asarray((2 * kept[1] < kept[0]).any(axis=0))
     if problem.shared:
         before, after = (np.full(len(theta), total) for total in (before.sum() + prior, after.sum() + prior_after))
-        lost[:] = lost.any()
+        lost[:] = 4 * lost.sum() > len(lost)
     limit = _RELATIVE * before + _TINY
     return np.asarray((after <= before + limit) & ~lost), np.asarray(np.abs(after - before) <= limit)
 
 
 def _comparable(before: Residuals, after: Residuals) -> Residuals:
-    """Return the residuals `after` a step; glints that only one of the two models has count as `before`."""
+    """Return the residuals `after` a step; features that only one of the two models has count as `before`."""
     both = (before.glint_ok & after.glint_ok)[..., None]
-    return replace(after, glints=np.where(both, after.glints, before.glints))
+    whole = ((before.outline_size > 0) & (after.outline_size > 0))[:, None]
+    return replace(
+        after,
+        glints=np.where(both, after.glints, before.glints),
+        outline=np.where(whole, after.outline, before.outline),
+    )
 
 
 def _result(
@@ -562,12 +715,16 @@ def _result(
     index = mine.index.take(first)
     side = EYES[max(int(index.eye[0]), 0)]
     gaze = gaze_slopes(problem.instants, theta)
-    known = eye_information(side, (index.fixation, index.head), matrix, gaze, unknowns)
     cost, prior = costs_of(problem, theta, found, weights)
     measures = int(found.outline_size.sum() + 2 * found.glint_ok.sum() + 2 * problem.has_target.sum())
     flat = int((problem.free & (problem.precision == 0))[:LOCAL].sum()) * len(theta)
     flat += int((problem.free & (problem.precision == 0))[LOCAL:].sum())
+    excess = max(1.0, float(cost.sum() + prior) / max(measures - flat, 1))
+    known = eye_information(side, (index.fixation, index.head), matrix / excess, gaze, unknowns)
     point, way = lines_of_sight(problem.instants, theta)
+    far = (np.abs(theta - problem.centre) * np.sqrt(problem.precision))[:, :LOCAL].max(axis=1) > MOST_DEVIATIONS
+    theta = np.where(far[:, None] & (np.arange(COUNT) < LOCAL), np.nan, theta)
+    point[far], way[far] = np.nan, np.nan
     return EyeFit(
         eye=side,
         rows=rows,
@@ -580,7 +737,8 @@ def _result(
         dof=measures - flat,
         outline_weight=np.where(found.outline_size > 0, weights.outline, np.nan),
         glint_weight=np.where(found.glint_ok, weights.glints, np.nan),
-        converged=converged,
+        converged=converged & ~far,
         prior=spec,
         unknowns=unknowns,
+        targets=int(problem.has_target.sum()),
     )

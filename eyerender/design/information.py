@@ -49,7 +49,7 @@ class Case:
         views: n views.
         instant: (n,) the instant of each view, 0 to i - 1.
         instants: one view for each of i instants, for values that do not depend on the camera.
-        theta: (i, 23) the true unknowns.
+        theta: (i, 35) the true unknowns.
         target_mm: (i, 3) fixation targets; NaN without one.
     """
 
@@ -106,7 +106,7 @@ def outline_normals(points_px: Floats, ok: Bools) -> tuple[Floats, Floats]:
 
 
 def whitened_slopes(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> tuple[Floats, Floats]:
-    """Compute derivatives over noise in n views: (n, k, 23) across the outline and (n, m, 2, 23) of glints."""
+    """Compute derivatives over noise in n views: (n, k, 35) across the outline and (n, m, 2, 35) of glints."""
     normal, length = outline_normals(slopes.images.outline_px, slopes.outline_ok)
     size = np.sqrt(length) / noise.outline_px[camera][:, None]
     across = np.einsum("nkx,nkxa->nka", normal, slopes.outline) * size[..., None]
@@ -115,14 +115,14 @@ def whitened_slopes(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) ->
 
 
 def information_of_views(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> Floats:
-    """Compute the information (n, 23, 23) of outline and glints in each view, the first two sums of equation (3)."""
+    """Compute the information (n, 35, 35) of outline and glints in each view, the first two sums of equation (3)."""
     across, glints = whitened_slopes(slopes, noise, camera)
     rows = np.concatenate([across, glints.reshape(len(camera), -1, COUNT)], axis=1)
     return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
 
 
 def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: int, free: Bools | None = None) -> Floats:
-    """Compute the information (i, 23, 23) of all views of each instant."""
+    """Compute the information (i, 35, 35) of all views of each instant."""
     out = np.zeros((len(case.theta), COUNT, COUNT))
     for first in range(0, len(case.views), _ROWS):
         rows = np.arange(first, min(first + _ROWS, len(case.views)))
@@ -133,7 +133,7 @@ def information_of_instants(case: Case, noise: FeatureNoise, boundary_points: in
 
 
 def target_information(case: Case, noise: FeatureNoise, rows: Ints) -> Floats:
-    """Compute the information (r, 23, 23) of known targets, the third sum of equation (3).
+    """Compute the information (r, 35, 35) of known targets, the third sum of equation (3).
 
     An instant without a target is assumed to fixate a point one metre away.
     """
@@ -158,10 +158,9 @@ class EyeInformation(ArrayValue):
         axis_covariance_deg2: (i, 2, 2) covariance of the optic axis' azimuth and elevation.
         frame_deviation: (i, 6) standard deviations of each frame's unknowns (`unknowns.FRAME`), rad and mm; 0 if known,
             inf if undetermined.
-        person_deviation: (17,) standard deviations of the person's unknowns (`unknowns.PERSON`), rad and mm.
-        person_covariance: (17, 17) covariance of these; inf on the diagonal if undetermined.
-        matrix: information on all unknowns.
-        names: names of its rows.
+        person_deviation: (29,) standard deviations of the person's unknowns (`unknowns.PERSON`), rad and mm.
+        person_covariance: (29, 29) covariance of these; inf on the diagonal if undetermined.
+        matrices: (i, 35, 35) information of each instant on its unknowns and the person's, without priors.
         unseen: combinations of unknowns that the rig does not determine, in words.
     """
 
@@ -173,8 +172,7 @@ class EyeInformation(ArrayValue):
     frame_deviation: Floats
     person_deviation: Floats
     person_covariance: Floats
-    matrix: Floats
-    names: tuple[str, ...]
+    matrices: Floats
     unseen: tuple[str, ...]
 
     @property
@@ -253,108 +251,106 @@ def information(
     return Information(tuple(found))
 
 
-def joint_matrix(matrices: Floats, unknowns: Unknowns) -> tuple[Floats, Bools]:
-    """Assemble the information on the unknowns of i instants (6 each) and of their person (17), and which are free.
-
-    Args:
-        matrices: (i, 23, 23) information of each instant, without priors.
-        unknowns: provides the priors.
-    """
-    count, own = len(matrices), LOCAL * len(matrices)
-    prior, free = unknowns.precision(), unknowns.free()
-    out = np.zeros((own + COUNT - LOCAL, own + COUNT - LOCAL))
-    for k, matrix in enumerate(matrices):
-        at = slice(LOCAL * k, LOCAL * (k + 1))
-        out[at, at] = matrix[:LOCAL, :LOCAL]
-        out[at, own:], out[own:, at] = matrix[:LOCAL, LOCAL:], matrix[LOCAL:, :LOCAL]
-        out[own:, own:] += matrix[LOCAL:, LOCAL:]
-    every = np.concatenate([np.tile(prior[:LOCAL], count), prior[LOCAL:]])
-    out[np.diag_indices_from(out)] += every
-    return out, np.concatenate([np.tile(free[:LOCAL], count), free[LOCAL:]])
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Inverse:
-    """Covariance of the determined combinations, and a basis (n, u) of the undetermined ones."""
+    """Covariance of each instant's and the person's unknowns, without combinations that are not determined.
+
+    Attributes:
+        covariance: (i, q, q) covariance of the q free unknowns.
+        unseen: for each instant an orthonormal basis (q, u) of its undetermined combinations.
+    """
 
     covariance: Floats
-    unseen: Floats
+    unseen: tuple[Floats, ...]
 
     def variance_of(self, slopes: Floats) -> Floats:
-        """Compute the covariance (q, q) of q linear functions (q, n); inf on the diagonal if undetermined."""
-        out = slopes @ self.covariance @ slopes.T
-        if self.unseen.shape[1]:
-            size = np.maximum(np.linalg.norm(slopes, axis=1), 1e-300)
-            lost = np.linalg.norm(slopes @ self.unseen, axis=1) / size > 1e-4
-            out[np.diag_indices_from(out)] = np.where(lost, np.inf, np.diag(out))
-        return np.asarray(out)
+        """Compute the covariance (i, f, f) of f linear functions (i, f, q); inf on the diagonal if undetermined."""
+        out: Floats = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
+        size = np.maximum(np.linalg.norm(slopes, axis=2), 1e-300)
+        for k, basis in enumerate(self.unseen):
+            lost = np.linalg.norm(slopes[k] @ basis, axis=1) / size[k] > 1e-4
+            out[k][np.diag_indices(len(lost))] = np.where(lost, np.inf, np.diag(out[k]))
+        return out
 
 
-def inverse(matrix: Floats) -> Inverse:
-    """Invert an information, scaled to a unit diagonal; directions with a singular value below `UNSEEN` are split off.
+def arrow_inverse(matrices: Floats, unknowns: Unknowns) -> Inverse:
+    """Invert the information on the unknowns of i instants and of their person, in time proportional to i.
 
-    The unseen basis is in the units of the unknowns, each divided by its scale.
+    Instants are coupled through the person alone. With the blocks A_i of an instant and its prior, B_i to the person
+    and C of the person and its prior, the person's covariance is P = (C - sum B_i^T A_i^-1 B_i)^-1, and that of an
+    instant is A_i^-1 + K_i P K_i^T with K_i = A_i^-1 B_i (block inversion). Blocks are scaled to a unit diagonal;
+    directions with an eigenvalue below `UNSEEN` are split off.
+
+    Args:
+        matrices: (i, 35, 35) information of each instant, without priors.
+        unknowns: provides the priors, and which unknowns are free.
     """
-    diagonal = np.sqrt(np.diag(matrix))
-    scale = np.where(diagonal > 0, 1.0 / np.where(diagonal > 0, diagonal, 1.0), 1.0)
-    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale)
+    prior, free = unknowns.precision(), unknowns.free()
+    local, person = np.flatnonzero(free[:LOCAL]), LOCAL + np.flatnonzero(free[LOCAL:])
+    a = matrices[:, local[:, None], local] + np.diag(prior[local])
+    c = matrices[:, person[:, None], person].sum(axis=0) + np.diag(prior[person])
+    own, common = _scales(np.einsum("iaa->ia", a)), _scales(np.diag(c))
+    b = matrices[:, local[:, None], person] * own[:, :, None] * common
+    values, vectors = np.linalg.eigh(a * own[:, :, None] * own[:, None])
     seen = values > UNSEEN
-    good = vectors[:, seen] * scale[:, None]
-    covariance = (good / values[seen]) @ good.T
-    lost = vectors[:, ~seen] * scale[:, None]
-    basis = np.linalg.qr(lost)[0] if lost.shape[1] else lost
-    return Inverse(covariance=covariance, unseen=basis)
+    half = vectors * np.where(seen, 1.0 / np.sqrt(np.where(seen, values, 1.0)), 0.0)[:, None]
+    inner = half @ np.swapaxes(half, 1, 2)
+    lift = inner @ b
+    weights, modes = np.linalg.eigh(c * common[:, None] * common - np.einsum("ilp,ilq->pq", b, lift))
+    good = weights > UNSEEN * (1.0 + np.sum((lift @ modes) ** 2, axis=(0, 1)))
+    scale = np.concatenate([own, np.broadcast_to(common, (len(own), len(common)))], axis=1)
+
+    def whole(columns: Floats) -> Floats:
+        """Complete columns (p, u) of the person by what they move in each instant, (i, q, u)."""
+        each = np.broadcast_to(columns, (len(lift), *columns.shape))
+        return np.asarray(np.concatenate([-(lift @ columns), each], axis=1) * scale[:, :, None])
+
+    root = whole(modes[:, good] / np.sqrt(weights[good]))
+    covariance = root @ np.swapaxes(root, 1, 2)
+    covariance[:, : len(local), : len(local)] += inner * own[:, :, None] * own[:, None]
+    lost, unseen = whole(modes[:, ~good]), []
+    for k, missing in enumerate(~seen):
+        alone = np.zeros((scale.shape[1], int(missing.sum())))
+        alone[: len(local)] = vectors[k][:, missing] * own[k][:, None]
+        unseen.append(np.linalg.qr(np.concatenate([alone, lost[k]], axis=1))[0])
+    return Inverse(covariance=covariance, unseen=tuple(unseen))
+
+
+def _scales(diagonal: Floats) -> Floats:
+    """Return 1 / sqrt(diagonal), 1 where it is 0."""
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
 
 
 def eye_information(
     eye: str, at: tuple[Ints, Ints], matrices: Floats, gaze: Floats, unknowns: Unknowns
 ) -> EyeInformation:
     """Compute the covariances of one eye from the information of its instants."""
-    count = len(matrices)
-    joint, free = joint_matrix(matrices, unknowns)
-    found = inverse(joint[np.ix_(free, free)])
-    size, own = len(free), LOCAL * count
-
-    def functions(rows: Floats) -> Floats:
-        """Compute the covariance of linear functions (q, all unknowns)."""
-        return found.variance_of(rows[:, free])
-
-    lines, axes = np.empty((count, 2, 2)), np.empty((count, 2, 2))
-    for k in range(count):
-        whole = np.zeros((2, size))
-        whole[:, LOCAL * k : LOCAL * (k + 1)], whole[:, own:] = gaze[k, :, :LOCAL], gaze[k, :, LOCAL:]
-        lines[k] = functions(whole)
-        axes[k] = functions(np.eye(2, size, LOCAL * k))
-    deviation = np.zeros(size)
-    deviation[free] = [np.sqrt(functions(np.eye(1, size, int(c)))[0, 0]) for c in np.flatnonzero(free)]
-    names = [f"{name} of instant {k}" for k in range(count) for name in NAMES[:LOCAL]] + list(PERSON)
-    names = [name for name, is_free in zip(names, free, strict=True) if is_free]
+    free = unknowns.free()
+    found = arrow_inverse(matrices, unknowns)
+    count, each = len(matrices), np.flatnonzero(free)
+    every = np.zeros((count, COUNT, COUNT))
+    every[:, each[:, None], each] = found.variance_of(np.tile(np.eye(len(each)), (count, 1, 1)))
+    deviation = np.sqrt(np.einsum("iaa->ia", every))
+    axes = np.tile(np.eye(2, COUNT)[:, each], (count, 1, 1))
     square = np.degrees(1.0) ** 2
     return EyeInformation(
         eye=eye,
         fixation=at[0],
         head=at[1],
-        gaze_covariance_deg2=lines * square,
-        axis_covariance_deg2=axes * square,
-        frame_deviation=deviation[:own].reshape(count, LOCAL),
-        person_deviation=deviation[own:],
-        person_covariance=functions(np.eye(size)[own:]),
-        matrix=joint[np.ix_(free, free)],
-        names=tuple(names),
-        unseen=described(found.unseen, names),
+        gaze_covariance_deg2=found.variance_of(gaze[:, :, each]) * square,
+        axis_covariance_deg2=found.variance_of(axes) * square,
+        frame_deviation=deviation[:, :LOCAL],
+        person_deviation=deviation[0, LOCAL:],
+        person_covariance=every[0, LOCAL:, LOCAL:],
+        matrices=matrices,
+        unseen=described(found.unseen, [NAMES[k] for k in each]),
     )
 
 
-def described(unseen: Floats, names: Sequence[str]) -> tuple[str, ...]:
+def described(unseen: Sequence[Floats], names: Sequence[str]) -> tuple[str, ...]:
     """Name the unknowns that take part in undetermined combinations, the largest share first."""
-    if not unseen.shape[1]:
-        return ()
-    share: dict[str, float] = {}
-    for name, part in zip(names, np.sum(unseen**2, axis=1), strict=True):
-        kind = name.split(" of instant")[0]
-        share[kind] = share.get(kind, 0.0) + float(part)
-    order = sorted((name for name, part in share.items() if part > 1e-6), key=lambda name: -share[name])
-    return tuple(order)
+    share = np.sum([np.sum(basis**2, axis=1) for basis in unseen], axis=0)
+    return tuple(names[k] for k in np.argsort(-share, kind="stable") if share[k] > 1e-6)
 
 
 def _mapping(one: EyeInformation) -> dict[str, Any]:

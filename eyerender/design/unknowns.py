@@ -1,12 +1,13 @@
 """The unknowns of a rig: numbers of a frame and of a person, each known, unknown, or with a prior.
 
-Parameters of one instant are a vector of 23 numbers in radians and millimetres. The first six belong to the frame, the
+Parameters of one instant are a vector of 35 numbers in radians and millimetres. The first six belong to the frame, the
 others to the person:
 
     azimuth, elevation, pupil diameter, slippage (x, y, z),
     corneal radius, asphericity, pupil depth, kappa (nasal, up), depth of the rotation centre, position (x, y, z),
     corneal toricity (straight, oblique), pupil centre (nasal, up), pupil ellipticity (straight, oblique),
-    shift of the pupil centre with size (nasal, up)
+    shift of the pupil centre with size (nasal, up), outline of the pupil (cosine and sine of harmonics 3 to 6),
+    difference in depth of the rotation centres, relative radius and toricity (straight, oblique) of the cornea's back
 
 Azimuth and elevation are those of the optic axis, and the pupil is the anatomical one. All others are differences from
 the eye at the start of the analysis.
@@ -23,22 +24,28 @@ from pydantic import Field
 from ..base.arrays import Floats
 from ..base.spec import Spec, read_yaml
 
+HARMONICS = (3, 4, 5, 6)
+"""Harmonics of the pupil's outline; the first is its centre, the second its ellipticity."""
 FRAME = ("azimuth", "elevation", "pupil", "slippage_x", "slippage_y", "slippage_z")
 PERSON = (
     "corneal_radius", "asphericity", "pupil_depth", "kappa_nasal", "kappa_up", "rotation_depth",
     "position_x", "position_y", "position_z",
     "toricity_straight", "toricity_oblique", "pupil_nasal", "pupil_up",
     "ellipticity_straight", "ellipticity_oblique", "pupil_shift_nasal", "pupil_shift_up",
+    *(f"margin_{part}_{k}" for k in HARMONICS for part in ("cosine", "sine")),
+    "rotation_gap", "posterior_radius", "posterior_toricity_straight", "posterior_toricity_oblique",
 )  # fmt: skip
 NAMES = (*FRAME, *PERSON)
 LOCAL, COUNT = len(FRAME), len(NAMES)
 AZIMUTH, ELEVATION, PUPIL, SLIPPAGE = 0, 1, 2, slice(3, 6)
 RADIUS, ASPHERICITY, DEPTH, KAPPA, ROTATION, POSITION = 6, 7, 8, slice(9, 11), 11, slice(12, 15)
 TORICITY, CENTRE, ELLIPTICITY, SHIFT = slice(15, 17), slice(17, 19), slice(19, 21), slice(21, 23)
+MARGIN, GAP, POSTERIOR, POSTERIOR_TORICITY = slice(23, 31), 31, 32, slice(33, 35)
 ANGLES = np.array([name in ("azimuth", "elevation", "kappa_nasal", "kappa_up") for name in NAMES])
-_RATIOS = {"asphericity": "1", "ellipticity": "1", "pupil_shift": "mm/mm"}
+_RATIOS = {"asphericity": "1", "ellipticity": "1", "pupil_shift": "mm/mm", "margin": "1", "posterior_radius": "1"}
 UNITS = tuple(
-    "deg" if angle else _RATIOS.get(name.rsplit("_", 1)[0], "mm") for name, angle in zip(NAMES, ANGLES, strict=True)
+    "deg" if angle else next((unit for start, unit in _RATIOS.items() if name.startswith(start)), "mm")
+    for name, angle in zip(NAMES, ANGLES, strict=True)
 )
 
 Knowledge = Literal["known", "unknown"] | Annotated[float, Field(gt=0, le=1e6)]
@@ -49,7 +56,7 @@ class Unknowns(Spec):
     """Prior knowledge of every number: `known`, `unknown`, or the standard deviation of a prior.
 
     A prior of a position or of a pair of angles holds for each component. The priors of `Unknowns.population` are
-    rounded standard deviations of adults (docs/population.md).
+    those of people (docs/population.md).
 
     >>> er.Unknowns.population(kappa_deg="known").kappa_deg
     'known'
@@ -79,38 +86,49 @@ class Unknowns(Spec):
     pupil_shift: Knowledge = Field(
         default="known", description="motion of the pupil's centre per mm of its diameter, nasal and up, mm/mm"
     )
+    margin: Knowledge = Field(
+        default="known",
+        description="cosine and sine part of the pupil's outline over its mean radius, for harmonics 3 to 6; a number "
+        "is the deviation of the third, and that of the k-th is (3 / k)^2 of it",
+    )
+    rotation_gap_mm: Knowledge = Field(
+        default="known", description="distance by which the azimuth's centre of rotation lies behind the elevation's"
+    )
+    posterior_radius: Knowledge = Field(
+        default="known", description="radii of the surfaces behind the cornea's front, over those that follow its own"
+    )
+    posterior_toricity_mm: Knowledge = Field(
+        default="known", description="toricity of the surfaces behind the cornea's front, as two numbers"
+    )
 
     @classmethod
     def population(cls, **fields: Knowledge) -> Self:
-        """Create population priors for all numbers of a person; of a frame, only 3 mm of slippage is known.
+        """Create the priors of people for all numbers of a person; of a frame, only 3 mm of slippage is known.
+
+        They are the rms differences of drawn people of all presets from the eye `adult`.
 
         Args:
             fields: values that replace some of them.
         """
-        priors = {
+        priors: dict[str, Knowledge] = {
             "slippage_mm": 3.0,
-            "corneal_radius_mm": 0.28,
+            "corneal_radius_mm": 0.27,
             "asphericity": 0.12,
-            "pupil_depth_mm": 0.35,
-            "kappa_deg": 2.0,
-            "rotation_depth_mm": 0.5,
+            "pupil_depth_mm": 0.42,
+            "kappa_deg": 1.4,
+            "rotation_depth_mm": 0.65,
+            "toricity_mm": 0.045,
+            "pupil_centre_mm": 0.12,
+            "ellipticity": 0.0145,
+            "pupil_shift": 0.05,
+            "margin": 0.008,
+            "rotation_gap_mm": 0.6,
+            "posterior_radius": 0.03,
+            "posterior_toricity_mm": 0.075,
         }
         return cls.from_mapping({**priors, **fields})
 
-    @classmethod
-    def shaped(cls, **fields: Knowledge) -> Self:
-        """Create the priors of `population`, with additional ones for toric corneas and elliptic pupils: rms of adults.
-
-        Args:
-            fields: values that replace some of them.
-        """
-        shapes: dict[str, Knowledge] = {
-            "toricity_mm": 0.065,
-            "pupil_centre_mm": 0.3,
-            "ellipticity": 0.015,
-            "pupil_shift": 0.07,
-        }
-        return cls.population(**{**shapes, **fields})
+    shaped = population  # its name while `population` had no shapes of cornea and pupil
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -118,23 +136,25 @@ class Unknowns(Spec):
         return cls.from_mapping(read_yaml(path), source=str(path))
 
     def deviations(self) -> Floats:
-        """Return standard deviations (23,) in rad and mm: 0 if known, inf if unknown."""
+        """Return standard deviations (35,) in rad and mm: 0 if known, inf if unknown."""
         groups = (
             (self.gaze_deg, 2), (self.pupil_mm, 1), (self.slippage_mm, 3), (self.corneal_radius_mm, 1),
             (self.asphericity, 1), (self.pupil_depth_mm, 1), (self.kappa_deg, 2), (self.rotation_depth_mm, 1),
             (self.position_mm, 3), (self.toricity_mm, 2), (self.pupil_centre_mm, 2), (self.ellipticity, 2),
-            (self.pupil_shift, 2),
+            (self.pupil_shift, 2), (self.margin, 2 * len(HARMONICS)),
+            (self.rotation_gap_mm, 1), (self.posterior_radius, 1), (self.posterior_toricity_mm, 2),
         )  # fmt: skip
         special = {"known": 0.0, "unknown": np.inf}
         values = [special[v] if isinstance(v, str) else float(v) for v, _ in groups]
         out = np.repeat(values, [count for _, count in groups])
+        out[MARGIN] *= np.repeat((HARMONICS[0] / np.array(HARMONICS)) ** 2, 2)
         return np.where(ANGLES, np.radians(out), out)
 
     def precision(self) -> Floats:
-        """Return prior precisions (23,): 1 / deviation^2, 0 both for unknown and for known numbers."""
+        """Return prior precisions (35,): 1 / deviation^2, 0 both for unknown and for known numbers."""
         deviation = self.deviations()
         return np.where(deviation > 0, 1.0 / np.where(deviation > 0, deviation, 1.0) ** 2, 0.0)
 
     def free(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Return which of the 23 numbers are not known, (23,)."""
+        """Return which of the 35 numbers are not known, (35,)."""
         return self.deviations() > 0

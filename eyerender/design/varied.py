@@ -33,8 +33,13 @@ from .unknowns import (
     DEPTH,
     ELEVATION,
     ELLIPTICITY,
+    GAP,
+    HARMONICS,
     KAPPA,
+    MARGIN,
     POSITION,
+    POSTERIOR,
+    POSTERIOR_TORICITY,
     PUPIL,
     RADIUS,
     ROTATION,
@@ -43,9 +48,9 @@ from .unknowns import (
     TORICITY,
 )
 
-TRACED = np.array([AZIMUTH, ELEVATION, PUPIL, 3, 4, 5, RADIUS, ASPHERICITY, DEPTH, 15, 16, 17, 18, 19, 20])
+TRACED = np.array([AZIMUTH, ELEVATION, 3, 4, 5, RADIUS, ASPHERICITY, DEPTH, 15, 16, 17, 18, POSTERIOR, 33, 34])
 STEPS = np.where(TRACED < PUPIL, 1e-4, 1e-3)
-"""Steps of the central differences by the traced unknowns: angles in rad, lengths in mm, Q, ellipticity."""
+"""Steps of the central differences by the traced unknowns: angles in rad, lengths in mm, Q."""
 _RAY_STEP = 1e-5
 _TOGETHER = 240_000
 """Points refracted at once: the search for the few rays that the compiled solver misses has a high cost per call."""
@@ -94,12 +99,12 @@ class ModelFeatures:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureSlopes:
-    """Features of n views with their derivatives with respect to the 23 unknowns.
+    """Features of n views with their derivatives with respect to the 35 unknowns.
 
     Attributes:
         images: the features.
-        outline: (n, k, 2, 23) derivatives, px per rad or mm; 0 for a missing point.
-        glints: (n, m, 2, 23) derivatives, px per rad or mm.
+        outline: (n, k, 2, 35) derivatives, px per rad or mm; 0 for a missing point.
+        glints: (n, m, 2, 35) derivatives, px per rad or mm.
         outline_ok: (n, k) whether a point is on the sensor, and its derivatives exist.
         glint_ok: (n, m) the same for glints.
     """
@@ -164,6 +169,8 @@ def _toric(surface: Surface, change: Floats, handed: Floats) -> Surface:
 
     A conic becomes the quadric (1 + Q) x^2 + (1 - t_c / R) y^2 - 2 (t_s / R) y z + (1 + t_c / R) z^2 + 2 R x = 0.
     """
+    if not np.any(change):
+        return surface
     straight, oblique = change[:, 0], handed * change[:, 1]
     if isinstance(surface, Biconic):
         mean, own = np.mean(surface.radii_mm, axis=-1), 0.5 * (surface.radii_mm[..., 0] - surface.radii_mm[..., 1])
@@ -197,7 +204,36 @@ def _varied_stop(stop: Stop, theta: Floats) -> Stop:
     first, second = stop.rotation[:, :, 1], stop.rotation[:, :, 2]
     rotation[:, :, 1] = (1.0 + straight) * first + oblique * second
     rotation[:, :, 2] = (1.0 - straight) * second + oblique * first
-    return replace(stop, centre_mm=centre, rotation=rotation, semi_axes_mm=stop.semi_axes_mm * wanted[:, None])
+    waves = max(stop.contour.shape[-1], HARMONICS[-1])
+    contour = np.zeros((len(theta), 2, waves))
+    contour[..., : stop.contour.shape[-1]] = stop.contour
+    contour[:, :, np.array(HARMONICS) - 1] += np.swapaxes(theta[:, MARGIN].reshape(len(theta), -1, 2), 1, 2)
+    axes = stop.semi_axes_mm * wanted[:, None]
+    return replace(stop, centre_mm=centre, rotation=rotation, semi_axes_mm=axes, contour=contour)
+
+
+def _outline_moves(stop: Stop, theta: Floats, count: int) -> Floats:
+    """Compute how the outline's points move with each unknown of its shape and size, (n, count, 3, 35) mm.
+
+    The three components are those of `CENTRE` and `DEPTH`: nasal, up, and backwards. A point of the outline moves in
+    the image like one that the pupil's centre carries along, so that these derivatives need no traces.
+    """
+    varied = _varied_stop(stop, theta)
+    angle = np.broadcast_to(2.0 * np.pi * np.arange(count) / count, (len(theta), count))
+    radius = varied.relative_radius(angle)
+    y = ((stop.handed * varied.semi_axes_mm[:, 0])[:, None] * np.cos(angle) * radius)[..., None]
+    z = (varied.semi_axes_mm[:, 1, None] * np.sin(angle) * radius)[..., None]
+    first, second = stop.rotation[:, None, :, 1], stop.rotation[:, None, :, 2]
+    offset = varied.boundary(count) - varied.centre_mm[:, None]
+    out = np.zeros((len(theta), count, 3, COUNT))
+    out[..., PUPIL] = offset / theta[:, PUPIL, None, None]
+    out[..., ELLIPTICITY.start] = y * first - z * second
+    out[..., ELLIPTICITY.start + 1] = stop.handed[:, None, None] * (y * second + z * first)
+    for k, column in zip(HARMONICS, range(MARGIN.start, MARGIN.stop, 2), strict=True):
+        out[..., column] = offset * (np.cos(k * angle) / radius)[..., None]
+        out[..., column + 1] = offset * (np.sin(k * angle) / radius)[..., None]
+    nasal, up, back = stop.handed[:, None, None] * out[:, :, 1], out[:, :, 2], -out[:, :, 0]
+    return np.stack([nasal, up, back], axis=2)
 
 
 def _widening(stop: Stop, theta: Floats) -> Floats:
@@ -206,26 +242,28 @@ def _widening(stop: Stop, theta: Floats) -> Floats:
 
 
 def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
-    """Apply unknowns (n, 23) to an eye, giving a batch of n; line of sight, lens and fovea stay.
+    """Apply unknowns (n, 35) to an eye, giving a batch of n; line of sight, lens and fovea stay.
 
-    The front of the cornea gets the radius R + dR. The surfaces behind it keep their ratio to it, and their toricity.
+    The front of the cornea gets the radius R + dR. The surfaces behind it follow in proportion, and have a relative
+    radius and a toricity of their own.
     """
     radius = radius_of(eye.front[0])
     factor = (radius + theta[:, RADIUS]) / radius
-    front = tuple(_scaled(surface, factor) for surface in eye.front)
-    front = (_flattened(front[0], theta[:, ASPHERICITY]), *front[1:])
-    if np.any(theta[:, TORICITY]):
-        front = (_toric(front[0], theta[:, TORICITY], eye.stop.handed), *front[1:])
-    shift = np.zeros_like(eye.stop.centre_mm)
-    shift[:, 0] = theta[:, ROTATION]
-    turns = eye.rotation
-    return replace(
-        eye,
-        front=front,
-        stop=_varied_stop(eye.stop, theta),
-        rotation=RotationCentres(
-            turns.azimuth_centre_mm - shift, turns.elevation_centre_mm - shift, turns.torsion_centre_mm
-        ),
+    behind = factor * (1.0 + theta[:, POSTERIOR])
+    first = _flattened(_scaled(eye.front[0], factor), theta[:, ASPHERICITY])
+    front = [_toric(first, theta[:, TORICITY], eye.stop.handed)]
+    front += [_toric(_scaled(s, behind), theta[:, POSTERIOR_TORICITY], eye.stop.handed) for s in eye.front[1:]]
+    return replace(eye, front=tuple(front), stop=_varied_stop(eye.stop, theta), rotation=_varied_centres(eye, theta))
+
+
+def _varied_centres(eye: EyeModel, theta: Floats) -> RotationCentres:
+    """Apply the unknowns of the rotation centres."""
+    turns, back = eye.rotation, np.array([1.0, 0.0, 0.0])
+    azimuth, elevation = theta[:, ROTATION] + theta[:, GAP] / 2.0, theta[:, ROTATION] - theta[:, GAP] / 2.0
+    return RotationCentres(
+        turns.azimuth_centre_mm - azimuth[:, None] * back,
+        turns.elevation_centre_mm - elevation[:, None] * back,
+        turns.torsion_centre_mm,
     )
 
 
@@ -235,7 +273,7 @@ def diameters_mm(eyes: EyeModel) -> Floats:
 
 
 def images_of(views: Views, theta: Floats, boundary_points: int) -> ModelFeatures:
-    """Trace the features of views with unknowns (n, 23)."""
+    """Trace the features of views with unknowns (n, 35)."""
     n, m, k = len(views), len(views.rig.lights), boundary_points
     outline, glints = np.full((n, k, 2), np.nan), np.full((n, m, 2), np.nan)
     outline_ok, glint_ok = np.zeros((n, k), dtype=bool), np.zeros((n, m), dtype=bool)
@@ -272,24 +310,24 @@ def _images_of_camera(views: Views, theta: Floats, number: int, k: int) -> tuple
 def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | None = None) -> FeatureSlopes:
     """Trace features and their derivatives with respect to the unknowns, by central differences in one batch.
 
-    Derivatives by the shapes of cornea and pupil (from `TORICITY` on) that are not `free` (23,) are 0.
+    Derivatives by unknowns that are not `free` (35,) may be 0.
     """
-    moves = np.arange(COUNT) < TORICITY.start
-    if free is not None:
-        moves |= free
-        moves[CENTRE] |= free[SHIFT]
+    moves = np.ones(COUNT, dtype=bool) if free is None else free.copy()
+    moves[CENTRE] = moves[DEPTH] = True  # those of the outline
+    moves[SLIPPAGE] |= moves[POSITION] | moves[ROTATION] | moves[GAP]
     use = moves[TRACED]
     traced_columns, steps = TRACED[use], STEPS[use]
     n, count = len(views), len(steps)
     shifts = np.zeros((1 + 2 * count, COUNT))
     shifts[1 : 1 + count, traced_columns] = np.diag(steps)
     shifts[1 + count :, traced_columns] = -np.diag(steps)
-    widening = _widening(take_eyes(views.eyes, views.person).stop, theta)
+    stop = take_eyes(views.eyes, views.person).stop
+    widening = _widening(stop, theta)
     every = np.tile(np.arange(n), len(shifts))
     all_theta = (theta[None] + shifts[:, None]).reshape(-1, COUNT)
     traced = images_of(views.take(every), all_theta, boundary_points)
 
-    def slopes(points: Floats, ok: Bools) -> tuple[Floats, Bools]:
+    def slopes(points: Floats, ok: Bools, moves: Floats | None = None) -> tuple[Floats, Bools]:
         points = points.reshape(len(shifts), n, *points.shape[1:])
         step = steps[:, None, None, None]
         central = (points[1 : 1 + count] - points[1 + count :]) / (2.0 * step)
@@ -298,13 +336,18 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
         out[..., POSITION] = out[..., SLIPPAGE]
         # The motion of a turned eye per depth of its rotation centre is that of x' = M (x - c) + c, and M e_x is the
         # optic axis.
+        by_azimuth = direction_of(theta[:, AZIMUTH], np.zeros(n)) - np.array([1.0, 0.0, 0.0])
         by_rotation = direction_of(theta[:, AZIMUTH], theta[:, ELEVATION]) - np.array([1.0, 0.0, 0.0])
         out[..., ROTATION] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], by_rotation)
+        out[..., GAP] = np.einsum("nkax,nx->nka", out[..., SLIPPAGE], by_azimuth - by_rotation / 2.0)
+        if moves is not None:
+            out += out[..., [CENTRE.start, CENTRE.start + 1, DEPTH]] @ moves
+            out[..., PUPIL] += np.einsum("nkxc,nc->nkx", out[..., CENTRE], theta[:, SHIFT])
         out[..., SHIFT] = out[..., CENTRE] * widening[:, None, None, None]
         exists: Bools = np.asarray(np.isfinite(out).all(axis=(2, 3)))
         return np.where(exists[..., None, None], out, 0.0), exists & ok[:n]
 
-    outline, outline_ok = slopes(traced.outline_px, traced.outline_ok)
+    outline, outline_ok = slopes(traced.outline_px, traced.outline_ok, _outline_moves(stop, theta, boundary_points))
     glints, glint_ok = slopes(traced.glints_px, traced.glint_ok)
     first = ModelFeatures(
         outline_px=traced.outline_px[:n],
@@ -327,7 +370,8 @@ def _lines_of(eye: EyeModel, views: Views, theta: Floats) -> tuple[Floats, Float
     nasal = np.arctan2(handed * way[:, 1], way[:, 0]) + theta[:, KAPPA][:, 0]
     up = np.arctan2(way[:, 2], way[:, 0]) + theta[:, KAPPA][:, 1]
     inside = normalize(np.stack([np.ones_like(up), handed * np.tan(nasal), np.tan(up)], axis=-1))
-    turn, shift = rigid_motion(Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), varied_eyes(eye, theta))
+    turned = replace(eye, rotation=_varied_centres(eye, theta))
+    turn, shift = rigid_motion(Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), turned)
     place = views.position_mm + theta[:, SLIPPAGE] + theta[:, POSITION]
     point = np.einsum("nij,nj->ni", turn, eye.chief_ray.point_mm) + shift + place
     return point, np.asarray(np.einsum("nij,nj->ni", turn, inside))
@@ -340,7 +384,7 @@ def tangents(direction: Floats) -> Floats:
 
 
 def gaze_slopes(views: Views, theta: Floats) -> Floats:
-    """Compute derivatives (n, 2, 23) of the line of sight's direction, left and up (rad), by the unknowns."""
+    """Compute derivatives (n, 2, 35) of the line of sight's direction, left and up (rad), by the unknowns."""
     eye = take_eyes(views.eyes, views.person)
     across = tangents(_lines_of(eye, views, theta)[1])
     columns = [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1]
@@ -359,14 +403,14 @@ def _misses(lines: tuple[Floats, Floats], target_mm: Floats) -> Floats:
 
 
 def target_slopes(views: Views, theta: Floats, target_mm: Floats) -> Floats:
-    """Compute derivatives (n, 2, 23) of `target_misses` by the unknowns."""
-    columns = [c for c in range(TORICITY.start) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)]
+    """Compute derivatives (n, 2, 35) of `target_misses` by the unknowns."""
+    columns = [c for c in range(TORICITY.start) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)] + [GAP]
     eye = take_eyes(views.eyes, views.person)
     return _differences(theta, columns, lambda t: _misses(_lines_of(eye, views, t), target_mm))
 
 
 def _differences(theta: Floats, columns: Sequence[int], function: object) -> Floats:
-    """Compute central differences (n, 2, 23) of a function of the unknowns with values (n, 2)."""
+    """Compute central differences (n, 2, 35) of a function of the unknowns with values (n, 2)."""
     assert callable(function)
     out = np.zeros((len(theta), 2, COUNT))
     for column in columns:

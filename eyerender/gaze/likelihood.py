@@ -1,9 +1,9 @@
 """Maximum-likelihood gaze: fit a traced eye model to pupil outlines and glints.
 
-A calibration fits the person (corneal radius, asphericity and toricity, pupil depth, centre, ellipticity and shift with
-size, kappa, centre of rotation) with the priors of a population, together with gaze, pupil and slippage of every frame.
-Afterwards these three are fitted for each frame alone. It is `design.fit` with equation (4) there, and approaches the
-Cramer-Rao bound of the rig where the model holds.
+A calibration fits the person (the cornea's surfaces, place and outline of the pupil, kappa, centres of rotation) with
+the priors of people, together with gaze, pupil and slippage of every frame. Afterwards these three are fitted for each
+frame alone. It is `design.fit` with equation (4) there, and approaches the Cramer-Rao bound of the rig where the model
+holds. What makes a fit doubtful (`EyeFit.doubts`) is a `FitWarning`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from .rays import NOT_CALIBRATED, is_none, screen_of
 if TYPE_CHECKING:
     from ..design.fit import EyeFit
 
-PERSON_NUMBERS = 17
+PERSON_NUMBERS = 29
 OUTLINE_PX, GLINT_PX = 0.2, 0.1
 """Deviations of features without a covariance (chosen): a sensor's noise, and what eyes still differ from the model."""
+FAR, UNSETTLED = "no eye near its place explains the features", "the fit did not converge"
 
 
 class _EyePerson(Spec):
@@ -49,10 +50,10 @@ class MaximumLikelihood(BuiltIn):
     Args:
         eye: name of the eye model from which the fits start.
         slippage_mm: standard deviation of the eye's position in a frame about the one in the record; 0: it is exact.
-        persons: numbers of the person (17,) by eye (0 right, 1 left), set by `fit`.
+        persons: numbers of the person (29,) by eye (0 right, 1 left), set by `fit`.
     """
 
-    eye: str = "E2"
+    eye: str = "adult"
     slippage_mm: float = 3.0
     persons: Mapping[int, Floats] = field(default_factory=dict, repr=False)
 
@@ -62,14 +63,17 @@ class MaximumLikelihood(BuiltIn):
     def fit(self, observations: Observations, rig: RigLike) -> Self:
         """Fit each eye's person to calibration targets.
 
+        Warns:
+            FitWarning: the features differ from those of any eye of the model, or do not determine the person.
+
         Raises:
-            InputError: there are no targets or no features.
+            InputError: there are no targets or no features, or they lead to an eye that cannot exist.
         """
         from ..design.unknowns import LOCAL, Unknowns
 
         if not np.isfinite(observations.index.target_mm).all(axis=1).any():
             raise InputError("a calibration needs records with target_mm")
-        unknowns = Unknowns.shaped(slippage_mm=self._slippage)
+        unknowns = Unknowns.population(slippage_mm=self._slippage)
         fits = self._fits(observations, rig, unknowns, targets=True)
         return replace(self, persons={eye: frozen(found.theta[0, LOCAL:]) for eye, found in fits.items()})
 
@@ -96,6 +100,8 @@ class MaximumLikelihood(BuiltIn):
             for found in self._fits(observations.take(usable), rig, unknowns, targets=False).values():
                 rows = usable[found.rows]
                 origin[rows], direction[rows] = found.origin_mm[found.instant], found.direction[found.instant]
+                reason[rows[~found.converged[found.instant]]] = UNSETTLED
+                reason[rows[np.isnan(direction[rows, 0])]] = FAR
         return GazeRays.of(origin, direction, reason)
 
     @property
@@ -104,7 +110,7 @@ class MaximumLikelihood(BuiltIn):
 
     def _fits(self, observations: Observations, rig: RigLike, unknowns: object, *, targets: bool) -> dict[int, EyeFit]:
         """Fit each eye's frames; the person's numbers are fixed if they are known and no targets are used."""
-        from ..design.fit import Options, fit_one
+        from ..design.fit import Options, fit_one, warn_of
         from ..design.noise import FeatureNoise
         from ..design.unknowns import Unknowns
         from ..eye.catalogue import load_eye
@@ -120,4 +126,5 @@ class MaximumLikelihood(BuiltIn):
                 out[int(eye)] = fit_one(observations, rows, built, load_eye(self.eye), unknowns, noise, options)
             except InputError as error:
                 raise error.placed(under=f"{EYES[max(int(eye), 0)]} eye") from None
+            warn_of(out[int(eye)], stacklevel=5)
         return out

@@ -18,13 +18,13 @@ from eyerender.optics.surfaces_biconic import Biconic
 from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace
 
-NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop", "keratoconus")
+NAMES = ("E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop", "adult", "keratoconus")
 
 
 def test_the_catalogue_is_complete():
     assert catalogue_names() == NAMES
     # Eyes of a study's software are the study's.
-    assert sorted(path.stem for path in FOLDER.glob("*.yaml")) == ["E1", "E2", "E3", "E4", "E5", "keratoconus"]
+    assert sorted(path.stem for path in FOLDER.glob("*.yaml")) == ["E1", "E2", "E3", "E4", "E5", "adult", "keratoconus"]
 
 
 @pytest.mark.parametrize("name", NAMES)
