@@ -12,6 +12,16 @@ and these displacements add up to the whole error in every frame. Their mean squ
     pattern   what differs between frames and repeats with every seed
     scatter   what differs between seeds (unbiased: over seeds - 1)
 
+Noise alone has neither shift nor pattern, yet means over few seeds are not 0. With r independent repetitions x_s of a
+vector of mean m and covariance V, the squares are therefore estimated without bias,
+
+    U = |mean x|^2 - tr V / r,      var U = 4 m^T V m / r + 2 tr V^2 / (r (r - 1))                                  (9)
+
+(Bai and Saranadasa 1996, Statistica Sinica 6, 311-329; tr V^2 by their estimate), and U +- t sd(U) gives the 95 %
+interval. The vector of the shift is the mean over an eye's frames, that of the pattern all frames less this mean, so
+frames of one seed may depend on each other, as they do by a noisy calibration. A step that was observed once has no
+seeds: its intervals are those over frames, and its pattern includes any noise.
+
 Squares of causes add up to the square of the total only if the causes are uncorrelated. `net_deg` is the change of the
 mean |error|. It is nearly zero where a displacement is perpendicular to the existing error, and may be negative.
 """
@@ -23,6 +33,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import t as student
 
 from ..base.arrays import Bools, Floats, Ints
@@ -36,6 +47,7 @@ BUDGET_SCHEMA = "eyerender/gaze-budget/1"
 _BOTH = 2
 _EYES = {-1: "unknown", **dict(enumerate(EYES)), _BOTH: "both"}
 Steps = Mapping[str, Observations | Sequence[Observations]]
+Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,10 +60,14 @@ class Cause:
         seeds: number of repetitions with other noise, 1 where nothing is random.
         rms_deg: rms angle between the paired estimates.
         shift_deg: the part common to all frames of an eye; rms over the eyes.
-        shift_by_eye_deg: the shift of each eye ("right", "left", "both"), to the subject's right and up.
+        shift_by_eye_deg: the mean displacement of each eye ("right", "left", "both"), to the subject's right and up.
         pattern_deg: the part that differs between frames, but not between seeds.
         scatter_deg: the part that differs between seeds; 0 for one seed.
         net_deg: change of the mean error.
+        rms_interval_deg: 95 % interval over seeds, or over frames for one seed; None for fewer than two frames.
+        shift_interval_deg: the same of the shift; it begins at 0 where noise may be all.
+        pattern_interval_deg: the same of the pattern.
+        scatter_interval_deg: the same of the scatter; None for one seed.
         net_low_deg: lower end of its 95 % interval (Student's t over the frames); None for fewer than two.
         net_high_deg: upper end.
     """
@@ -65,6 +81,10 @@ class Cause:
     pattern_deg: float
     scatter_deg: float
     net_deg: float
+    rms_interval_deg: Interval | None
+    shift_interval_deg: Interval | None
+    pattern_interval_deg: Interval | None
+    scatter_interval_deg: Interval | None
     net_low_deg: float | None
     net_high_deg: float | None
 
@@ -211,23 +231,93 @@ def mean_interval(values: Floats) -> tuple[float, float, float]:
     return mean, mean - half, mean + half
 
 
-def displacement(before: Floats, after: Floats, eye: Ints) -> tuple[float, dict[int, Floats], float, float]:
-    """Split gaze displacements into rms, shift (2,) by eye, pattern and scatter, all in degrees.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Displacement:
+    """The parts of a displacement of gaze: squares (deg^2) with their 95 % intervals, and the mean (2,) of each eye."""
+
+    rms: tuple[float, Interval | None]
+    shift: tuple[float, Interval | None]
+    pattern: tuple[float, Interval | None]
+    scatter: tuple[float, Interval | None]
+    by_eye: dict[int, Floats]
+
+
+def displacement(before: Floats, after: Floats, eye: Ints) -> Displacement:
+    """Split gaze displacements into shift, pattern and scatter, equation (9).
 
     Args:
-        before: (s, n, 2) error vectors of n frames; s is 1, or the number of seeds of `after`.
+        before: (s, n, 2) error vectors of n frames in degrees; s is 1, or the number of seeds of `after`.
         after: (s, n, 2) error vectors with s seeds.
         eye: (n,) the eye of each frame.
     """
     moved = after - before
-    seeds = len(moved)
-    shift = {int(k): np.asarray(moved[:, eye == k].mean(axis=(0, 1))) for k in np.unique(eye)}
-    common = sum(float(np.mean(eye == k)) * float(v @ v) for k, v in shift.items())
-    square = float(np.mean(np.sum(moved**2, axis=2)))
-    within = float(np.mean(np.sum((moved - moved.mean(axis=0)) ** 2, axis=2)))
-    scatter = within * seeds / (seeds - 1) if seeds > 1 else 0.0
-    pattern = max(square - common - scatter, 0.0)
-    return float(np.sqrt(square)), shift, float(np.sqrt(pattern)), float(np.sqrt(scatter))
+    seeds, frames = moved.shape[:2]
+    by_eye = {int(k): np.asarray(moved[:, eye == k].mean(axis=(0, 1))) for k in np.unique(eye)}
+    if seeds == 1:
+        return _of_frames(moved[0], eye, by_eye)
+    each = np.stack([moved[:, eye == k].mean(axis=1) for k in by_eye], axis=1)  # (seeds, eyes, 2)
+    share = np.array([np.mean(eye == k) for k in by_eye])
+    rest = moved - each[:, np.searchsorted(list(by_eye), eye)]
+    size = np.sum(moved**2, axis=2).mean(axis=1)
+    everything = moved.reshape(seeds, -1) / np.sqrt(frames)
+    total, second = _traces(everything)
+    return Displacement(
+        rms=(float(size.mean()), mean_interval(size)[1:]),
+        shift=_squared_mean([(each * np.sqrt(share)[:, None]).reshape(seeds, -1)]),
+        pattern=_squared_mean([rest.reshape(seeds, -1) / np.sqrt(frames)]),
+        scatter=(total, _variance_interval(total, (seeds - 1) * total**2 / second if second > 0 else 1.0)),
+        by_eye=by_eye,
+    )
+
+
+def _of_frames(moved: Floats, eye: Ints, by_eye: dict[int, Floats]) -> Displacement:
+    """Split displacements (n, 2) that were observed once; their intervals are those of a sample of frames."""
+    eyes = [moved[eye == k] for k in by_eye]
+    size = np.sum(moved**2, axis=1)
+    shift = float(sum(len(one) * v @ v for one, v in zip(eyes, by_eye.values(), strict=True)) / len(moved))
+    pattern = max(float(size.mean()) - shift, 0.0)
+    enough = min(map(len, eyes)) > 1
+    rest = np.concatenate([one - one.mean(axis=0) for one in eyes])
+    second = float(np.sum((rest.T @ rest / len(rest)) ** 2))
+    degrees = (len(moved) - len(eyes)) * (pattern**2 / second if second > 0 else 1.0)
+    scaled = [one * np.sqrt(len(one) / len(moved)) for one in eyes]
+    return Displacement(
+        rms=(float(size.mean()), mean_interval(size)[1:] if len(size) > 1 else None),
+        shift=(shift, _squared_mean(scaled)[1] if enough else None),
+        pattern=(pattern, _variance_interval(pattern, degrees) if enough else None),
+        scatter=(0.0, None),
+        by_eye=by_eye,
+    )
+
+
+def _traces(x: Floats) -> tuple[float, float]:
+    """Estimate tr V and tr V^2 without bias from r >= 2 repetitions (r, k) of a vector with covariance V."""
+    count, away = len(x), x - x.mean(axis=0)
+    products = away @ away.T / (count - 1)
+    total, square = float(np.trace(products)), float(np.sum(products**2))
+    if count == 2:
+        return total, square
+    scale = (count - 1) ** 2 / ((count - 2) * (count + 1))
+    return total, max(scale * (square - total**2 / (count - 1)), 0.0)
+
+
+def _squared_mean(groups: Sequence[Floats]) -> tuple[float, Interval]:
+    """Estimate the sum of |mean|^2 of independent groups of repetitions (r, k), equation (9), with its interval."""
+    square, variance = 0.0, 0.0
+    for x in groups:
+        count, mean = len(x), x.mean(axis=0)
+        total, second = _traces(x)
+        along = max(float(np.sum(((x - mean) @ mean) ** 2)) / (count - 1) - second / count, 0.0)
+        square += float(mean @ mean) - total / count
+        variance += 4.0 * along / count + 2.0 * second / (count * (count - 1))
+    half = float(student.ppf(0.975, min(map(len, groups)) - 1)) * np.sqrt(variance)
+    return square, (square - half, square + half)
+
+
+def _variance_interval(variance: float, degrees: float) -> Interval:
+    """Compute the interval of a variance with (Satterthwaite's) degrees of freedom."""
+    low, high = (variance * degrees / float(chi2.ppf(q, degrees)) for q in (0.975, 0.025))
+    return low, high
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,22 +394,29 @@ def _check(chain: Sequence[tuple[str, list[Observations]]]) -> None:
 def _cause(name: str, before: Floats, after: Floats, eye: Ints) -> Cause:
     # The mean over the seeds of a noisy step is what the next one is compared with.
     paired = before if len(before) in (1, len(after)) else before.mean(axis=0, keepdims=True)
-    rms, shift, pattern, scatter = displacement(paired, after, eye)
+    parts = displacement(paired, after, eye)
     net = (_size(after).mean(axis=0) - _size(before).mean(axis=0)).ravel()
     mean, low, high = mean_interval(net)
+    squares = {name: getattr(parts, name) for name in ("rms", "shift", "pattern", "scatter")}
     return Cause(
         name=name,
         frames=len(net),
         seeds=len(after),
-        rms_deg=rms,
-        shift_deg=float(np.sqrt(sum(np.mean(eye == k) * (v @ v) for k, v in shift.items()))),
-        shift_by_eye_deg={_EYES[k]: (float(v[0]), float(v[1])) for k, v in shift.items()},
-        pattern_deg=pattern,
-        scatter_deg=scatter,
+        shift_by_eye_deg={_EYES[k]: (float(v[0]), float(v[1])) for k, v in parts.by_eye.items()},
         net_deg=mean,
         net_low_deg=low,
         net_high_deg=high,
+        **{f"{part}_deg": root(square) for part, (square, _) in squares.items()},
+        **{
+            f"{part}_interval_deg": None if ends is None else (root(ends[0]), root(ends[1]))
+            for part, (_, ends) in squares.items()
+        },
     )
+
+
+def root(square: float) -> float:
+    """Return the root of a square, 0 if its estimate is negative."""
+    return float(np.sqrt(max(square, 0.0)))
 
 
 def _size(errors: Floats) -> Floats:
@@ -331,11 +428,15 @@ def _rms(errors: Floats) -> float:
 
 
 def _table(title: str, causes: Sequence[Cause], total: float, mean: float) -> list[str]:
-    width = max(len(c.name) for c in causes)
-    heads = "".join(f"{name + ' deg':>13}" for name in ("rms", "shift", "pattern", "scatter", "net"))
-    lines = [title, f"{'cause':<{width}}{heads}   net, 95 % deg"]
+    width = max(len("95 %"), *(len(c.name) for c in causes))
+    parts = ("rms", "shift", "pattern", "scatter")
+    heads = "".join(f"{name + ' deg':>19}" for name in (*parts, "net"))
+    lines = [title, f"{'cause':<{width}}{heads}"]
     for c in causes:
-        numbers = "".join(f"{v:>13.4f}" for v in (c.rms_deg, c.shift_deg, c.pattern_deg, c.scatter_deg))
-        ends = "" if c.net_low_deg is None else f"   {c.net_low_deg:+.4f} to {c.net_high_deg:+.4f}"
-        lines.append(f"{c.name:<{width}}{numbers} {c.net_deg:>+12.4f}{ends}")
-    return [*lines, f"{'total':<{width}}{total:>13.4f}   mean error {mean:.4f} deg"]
+        values = [getattr(c, f"{part}_deg") for part in parts]
+        ends = [getattr(c, f"{part}_interval_deg") for part in parts]
+        lines.append(f"{c.name:<{width}}" + "".join(f"{v:>19.4f}" for v in values) + f"{c.net_deg:>+19.4f}")
+        cells = ["" if e is None else f"{e[0]:.4f} to {e[1]:.4f}" for e in ends]
+        cells.append("" if c.net_low_deg is None else f"{c.net_low_deg:+.4f} to {c.net_high_deg:+.4f}")
+        lines.append(f"{'95 %':<{width}}" + "".join(f"{cell:>19}" for cell in cells))
+    return [*lines, f"{'total':<{width}}{total:>19.4f}   mean error {mean:.4f} deg"]

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Ints
-from ...gaze.budget import displacement, mean_interval
+from ...gaze.budget import displacement, mean_interval, root
 from .results import ModelResults
 
 ALGORITHM, EYE, IMAGE, NOISE, BOTH = "algorithm", "eye model", "image", "noise", "image and noise"
@@ -168,10 +168,10 @@ def _moved(before: _Step, after: _Step, rows: Bools, eye: Ints) -> dict[str, Any
     rows = rows & np.isfinite(vectors).all(axis=(0, 2))
     if not rows.any():
         return {}
-    rms, shift, pattern, scatter = displacement(before.vectors[None, rows], vectors[:, rows], eye[rows])
-    common = sum(float(np.mean(eye[rows] == k)) * float(v @ v) for k, v in shift.items())
-    several = {} if after.seeds is None else {"scatter_deg": scatter, "seeds": len(after.seeds)}
-    return {"rms_deg": rms, "shift_deg": float(np.sqrt(common)), "pattern_deg": pattern, **several}
+    parts = displacement(before.vectors[None, rows], vectors[:, rows], eye[rows])
+    several = {} if after.seeds is None else {"scatter_deg": root(parts.scatter[0]), "seeds": len(after.seeds)}
+    found = {f"{name}_deg": root(getattr(parts, name)[0]) for name in ("rms", "shift", "pattern")}
+    return {**found, **several}
 
 
 def _name(observer: str, steps: Sequence[str]) -> str:
