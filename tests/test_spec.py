@@ -67,6 +67,7 @@ def test_shipped_scenes_load_and_come_back_from_their_own_yaml(tmp_path):
     assert sorted(shipped_scenes()) == [
         "blignaut2014",
         "desktop_tracker",
+        "eyelink_desktop",
         "guestrin2006",
         "head_mounted",
         "headset",

@@ -184,6 +184,15 @@ def _gaze_table(data: dict[str, Any]) -> str:
             numbers = "".join(_cell(figures.get(name), ".3f") for name in ("mean", "median", "p95"))
             lines.append(f"{start}  {unit:<6}{numbers}")
             start = " " * len(start)
+    for entry in data["summary"]:
+        if entry["quality"]:
+            values = {name: _cell(value, ".3g").strip() for name, value in entry["quality"].items()}
+            lines.append(
+                "{eye}: medians of {fixations} fixations: accuracy {accuracy_deg} deg, RMS-S2S {rms_s2s_deg} deg, "
+                "SD {sd_deg} deg, their ratio {s2s_over_sd}, BCEA {bcea_deg2} deg^2, data loss {data_loss}".format(
+                    eye=entry["eye"] or "-", **values
+                )
+            )
     lines += [f"degrees: place of the eye {PLACES[place]}" for place in PLACES if _uses(data, place)]
     return "\n".join(lines)
 

@@ -20,6 +20,8 @@ from .homography import Homography as Homography
 from .likelihood import MaximumLikelihood as MaximumLikelihood
 from .parameters import EyeParameters as EyeParameters
 from .parameters import ParameterBounds as ParameterBounds
+from .quality import Quality as Quality
+from .quality import quality as quality
 from .recalibration import Recalibration as Recalibration
 from .records import load_observations as load_observations
 from .records import load_rig as load_rig

@@ -9,6 +9,7 @@ at 600 mm by 1 %.
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -25,6 +26,7 @@ from ..scene.observation import EYES, Observations
 from .cornea import centres_of
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .parameters import MEAN_EYE
+from .quality import quality
 from .rays import NOT_CALIBRATED, feature_rays, is_none, targets_on_screen
 
 POINTS_SCHEMA, RAYS_SCHEMA = "eyerender/gaze/3", "eyerender/gaze/4"
@@ -71,7 +73,7 @@ def predictions(
         }
         for i in range(len(observations))
     ]
-    summary = _by_eye(observations, gaze.ok, errors, source)
+    summary = _by_eye(observations, gaze.ok, errors, source, (gaze.point_mm, place))
     binocular: list[dict[str, Any]] = []
     if len(np.unique(index.eye[index.eye >= 0])) == 2:
         frames, both = binocular_average(observations, gaze)
@@ -92,7 +94,8 @@ def predictions(
             }
             for i in range(len(both))
         ]
-        summary.append({"eye": "both", **_summary(both.ok, errors, source)})
+        precision = _precision(both.point_mm, frames.index.target_mm, middle)
+        summary.append({"eye": "both", **_summary(both.ok, errors, source), "quality": precision})
     return {"schema": POINTS_SCHEMA, "gaze": single, "binocular": binocular, "summary": summary}
 
 
@@ -100,6 +103,8 @@ def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: R
     with np.errstate(all="ignore"):
         rays = estimator.predict_rays(observations, rig)
         errors = {"deg": ray_errors_deg(observations, rays)}
+        reach = np.linalg.norm(observations.index.target_mm - rays.origin_mm, axis=1)
+        aim = rays.origin_mm + reach[:, None] * rays.direction
     status = np.where(rays.ok, Status.OK, Status.NO_ESTIMATE)
     entries = [
         {
@@ -118,7 +123,7 @@ def _ray_predictions(estimator: RayEstimator, observations: Observations, rig: R
         "schema": RAYS_SCHEMA,
         "gaze": entries,
         "binocular": [],
-        "summary": _by_eye(observations, rays.ok, errors, source),
+        "summary": _by_eye(observations, rays.ok, errors, source, (aim, rays.origin_mm)),
     }
 
 
@@ -248,14 +253,33 @@ def _middles(observations: Observations, place: Floats, frames: Observations) ->
     return np.where(np.isfinite(head).all(axis=1, keepdims=True), head, middle)
 
 
-def _by_eye(observations: Observations, ok: Bools, errors: dict[str, Floats], source: Objects) -> list[dict[str, Any]]:
-    """Summarise the errors of each eye."""
+def _by_eye(
+    observations: Observations, ok: Bools, errors: dict[str, Floats], source: Objects, gaze: tuple[Floats, Floats]
+) -> list[dict[str, Any]]:
+    """Summarise the errors and the precision of each eye; `gaze` are gaze points and places of the eye, (n, 3) mm."""
     out = []
     for eye in np.unique(observations.index.eye):
         rows = observations.index.eye == eye
         part = {unit: values[rows] for unit, values in errors.items()}
-        out.append({"eye": EYES[int(eye)] if eye >= 0 else None, **_summary(ok[rows], part, source[rows])})
+        precision = _precision(gaze[0][rows], observations.index.target_mm[rows], gaze[1][rows])
+        name = EYES[int(eye)] if eye >= 0 else None
+        out.append({"eye": name, **_summary(ok[rows], part, source[rows]), "quality": precision})
     return out
+
+
+def _precision(point_mm: Floats, target_mm: Floats, from_mm: Floats) -> dict[str, Any] | None:
+    """Compute the medians of `quality` over runs of at least two samples of one target; None if there are none."""
+    new = np.any(target_mm[1:] != target_mm[:-1], axis=1)
+    runs = np.split(np.arange(len(target_mm)), np.flatnonzero(new) + 1)
+    known = [run for run in runs if len(run) > 1 and np.isfinite(target_mm[run[0]]).all()]
+    if not known:
+        return None
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # medians of nothing
+        each = [quality(point_mm[r][:, None], target_mm[r[:1]], np.nanmean(from_mm[r], axis=0)) for r in known]
+        names = ("accuracy_deg", "rms_s2s_deg", "sd_deg", "s2s_over_sd", "bcea_deg2", "data_loss")
+        medians = {name: np.nanmedian([getattr(one, name) for one in each]) for name in names}
+    return {"fixations": len(known), **{name: finite_or_none(value) for name, value in medians.items()}}
 
 
 def _summary(ok: Bools, errors: dict[str, Floats], source: Objects) -> dict[str, Any]:

@@ -8,9 +8,11 @@ PARTIAL. In a record a status is a word: "ok", "partial", or "missing" for all o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -174,6 +176,17 @@ class LensGlintFeatures(GlintFeatures):
     index: Ints = column()
 
 
+WHITE = math.sqrt(2.0)
+"""RMS-S2S over SD of white noise."""
+
+
+class PixelNoise(Protocol):
+    """Noise of features, such as `er.design.FeatureNoise`: px of outline (cameras,), of glints (cameras, lights)."""
+
+    outline_px: Floats
+    glint_px: Floats
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Observations(ArrayValue):
     """A batch of observations, in frame order and with the right eye first within a frame.
@@ -202,6 +215,69 @@ class Observations(ArrayValue):
         """Replace the targets by points (n, 3) or (3,) mm in the world, NaN where there is none."""
         targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
         return replace(self, index=replace(self.index, target_mm=frozen(targets)))
+
+    def with_noise(
+        self, noise: PixelNoise | float, seed: int | np.random.Generator = 0, *, s2s_over_sd: float = WHITE
+    ) -> Observations:
+        """Displace pupils and glints by Gaussian noise; outlines move with their pupils.
+
+        The rows of each eye and camera are a series in time, with an autoregressive noise of first order: successive
+        displacements correlate by 1 - r^2 / 2, so that the rms of their differences is r times their deviation
+        (Niehorster et al. 2020, Behav. Res. Methods 52, 2515-2534, measure trackers by this ratio). Covariances, where
+        there are any, grow by the noise.
+
+        >>> seen = er.trace(er.load_scene("headset"))
+        >>> moved = seen.with_noise(0.05, seed=1).pupil.centre_px - seen.pupil.centre_px
+        >>> bool(0 < np.abs(moved).max() < 0.3)
+        True
+
+        Args:
+            noise: standard deviation in px along each axis, or the noise of `er.sensor_noise`: a circle of radius r
+                whose outline has the noise s per px has the noise s / sqrt(pi r) of its centre. Glints that cannot be
+                located stay.
+            seed: selects the noise; or a generator that makes it.
+            s2s_over_sd: the type of noise: RMS-S2S over SD, sqrt(2) for white noise, less for filtered.
+
+        Raises:
+            InputError: the noise is negative, or the ratio is not between 0 and 2.
+        """
+        if not 0.0 < s2s_over_sd < 2.0:
+            raise InputError(f"must be > 0 and < 2, not {s2s_over_sd}", path="s2s_over_sd")
+        pupil, glints, size = self.pupil, self.glints, self._noise_px(noise)
+        series = np.unique(np.stack([self.index.eye, self.index.camera]), axis=1, return_inverse=True)[1].reshape(-1)
+        rng = np.random.default_rng(seed)
+        unit = np.concatenate([rng.standard_normal((len(self), k, 2)) for k in (1, glints.light.shape[1])], axis=1)
+        kept = 1.0 - s2s_over_sd**2 / 2.0
+        for one in np.unique(series) if kept else ():
+            rows = np.flatnonzero(series == one)
+            for before, row in pairwise(rows.tolist()):
+                unit[row] = kept * unit[before] + np.sqrt(1.0 - kept**2) * unit[row]
+        moves = size[..., None] * unit
+        wider = (size**2)[..., None, None] * np.eye(2)
+        covariance = np.array(pupil.covariance)
+        covariance[:, :2, :2] += wider[:, 0]
+        return replace(
+            self,
+            pupil=replace(
+                pupil,
+                centre_px=pupil.centre_px + moves[:, 0],
+                points_px=pupil.points_px + moves[:, :1],
+                covariance=covariance,
+            ),
+            glints=replace(glints, xy_px=glints.xy_px + moves[:, 1:], covariance=glints.covariance + wider[:, 1:]),
+        )
+
+    def _noise_px(self, noise: PixelNoise | float) -> Floats:
+        """Return the standard deviations (n, 1 + m) px of the pupil's centre and of each glint."""
+        if isinstance(noise, int | float):
+            if not 0.0 <= noise < np.inf:
+                raise InputError(f"must be >= 0, not {noise}", path="noise")
+            return np.full((len(self), 1 + self.glints.light.shape[1]), float(noise))
+        camera = np.maximum(self.index.camera, 0)
+        radius = np.sqrt(np.prod(self.pupil.semi_axes_px, axis=1))
+        centre = noise.outline_px[camera] / np.sqrt(np.pi * radius)
+        glints = noise.glint_px[camera[:, None], np.maximum(self.glints.light, 0)]
+        return np.concatenate([centre[:, None], np.where(np.isfinite(glints), glints, 0.0)], axis=1)
 
     def records(self) -> Iterator[dict[str, Any]]:
         """Yield one record (docs/formats.md) per observation; every key is present, null where it does not apply."""

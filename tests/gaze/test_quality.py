@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import eyerender as er
 from eyerender.base.arrays import frozen
 from eyerender.base.errors import InputError
+from eyerender.cli.main import run
 from eyerender.gaze.estimate import GazePoints, binocular_average
 from eyerender.gaze.quality import quality
 from eyerender.gaze.regression import Regression, pupil_glint_vectors
+from eyerender.gaze.store import save_estimator
 from tests.support.gaze import observations
 from tests.support.regression import RIG, synthetic
 
@@ -25,6 +31,80 @@ def test_quality_of_known_noise():
     np.testing.assert_allclose(q.accuracy_deg[0], np.degrees(np.arctan(offset / distance)), atol=0.01)
     np.testing.assert_allclose(q.sd_deg[0], np.degrees(sigma_mm * np.sqrt(2) / distance), rtol=0.02)
     np.testing.assert_allclose(q.rms_s2s_deg / q.sd_deg, np.sqrt(2), rtol=0.03)
+
+
+def test_lost_samples_and_the_ellipse_of_normal_ones():
+    """A correlated normal cloud: 68.27 % lie in an ellipse of the BCEA's area, 2 k pi sx sy sqrt(1 - rho^2)."""
+    rng = np.random.default_rng(3)
+    sx, sy, rho = 0.4, 0.15, 0.6
+    angles = rng.multivariate_normal([0, 0], [[sx**2, rho * sx * sy], [rho * sx * sy, sy**2]], 20000)
+    way = np.stack([np.ones(len(angles)), *np.tan(np.radians(angles)).T], axis=-1)[:, None] * 700
+    way[rng.random(len(way)) < 0.1] = np.nan
+    q = quality(way, np.array([[700.0, 0, 0]]), np.zeros(3))
+    area = -2 * np.log(1 - 0.6827) * np.pi * sx * sy * np.sqrt(1 - rho**2)
+    np.testing.assert_allclose(q.bcea_deg2, area, rtol=0.03)  # 18,000 samples know an area to 1 %
+    np.testing.assert_allclose(q.data_loss, 0.1, atol=0.01)
+    np.testing.assert_allclose(q.sd_deg, np.hypot(sx, sy), rtol=0.02)
+    np.testing.assert_allclose(q.s2s_over_sd, np.sqrt(2), rtol=0.02)
+    nothing = quality(np.full((5, 1, 3), np.nan), np.array([[700.0, 0, 0]]), np.zeros(3))
+    assert (nothing.data_loss, np.isnan(nothing.sd_deg), np.isnan(nothing.accuracy_deg)) == (1.0, True, True)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.0, np.sqrt(2), 1.8])
+def test_noise_has_the_size_and_the_type_that_are_asked_for(ratio):
+    """RMS-S2S over SD within 3 %, the SD of pupil and glint as well; both cameras have series of their own."""
+    scene = er.load_scene("guestrin2006")
+    seen = er.trace(scene.frames()[:2]).take(np.tile([0, 1], 20000))
+    found = seen.with_noise(0.2, seed=4, s2s_over_sd=ratio)
+    for one, two in (
+        (found.pupil.centre_px, seen.pupil.centre_px),
+        (found.glints.xy_px[:, 0], seen.glints.xy_px[:, 0]),
+    ):
+        for eye in (0, 1):
+            move = (one - two)[seen.index.eye == eye]
+            np.testing.assert_allclose(np.sqrt(np.mean(move**2)), 0.2, rtol=0.03)
+            s2s = np.sqrt(np.mean(np.sum(np.diff(move, axis=0) ** 2, axis=1)))
+            np.testing.assert_allclose(s2s / np.sqrt(np.mean(np.sum(move**2, axis=1))), ratio, rtol=0.03)
+    assert found.pupil.points_px - seen.pupil.points_px == pytest.approx(
+        np.broadcast_to((found.pupil.centre_px - seen.pupil.centre_px)[:, None], seen.pupil.points_px.shape), abs=1e-9
+    )
+
+
+def test_noise_of_a_sensor_is_that_of_circles_and_glints():
+    scene = er.load_scene("guestrin2006")
+    noise = er.design.FeatureNoise.of(0.3, 0.05, rig=scene.rig)
+    seen = er.trace(scene.frames()[:1]).take(np.zeros(5000, dtype=int))
+    found = seen.with_noise(noise, seed=2)
+    radius = np.sqrt(np.prod(seen.pupil.semi_axes_px[0]))
+    assert np.std(found.pupil.centre_px[:, 0]) == pytest.approx(0.3 / np.sqrt(np.pi * radius), rel=0.04)
+    assert np.std(found.glints.xy_px[:, 1, 1]) == pytest.approx(0.05, rel=0.04)
+    assert (seen.with_noise(0.0).pupil.centre_px == seen.pupil.centre_px).all()
+    for bad in ({"noise": -1.0}, {"noise": 0.1, "s2s_over_sd": 2.5}):
+        with pytest.raises(InputError, match="must be"):
+            seen.with_noise(**bad)
+
+
+def test_the_command_reports_precision_of_repeated_samples(tmp_path, capsys):
+    """Records with noise, ten of each target: the JSON and the text state the figures, those of `quality`."""
+    scene = er.load_scene("guestrin2006")
+    frames = scene.frames()
+    rows = np.flatnonzero((frames.index.head == 0) & (frames.index.eye == 0))
+    exact = er.trace(frames.take(rows))
+    save_estimator(tmp_path / "c.json", er.gaze.GuestrinEizenman().fit(exact, scene.rig), scene.rig)
+    many = exact.take(np.repeat(np.arange(len(exact)), 10))
+    noisy = replace(many, index=replace(many.index, frame=np.arange(len(many)))).with_noise(0.1, seed=3)
+    data = {"rig": scene.rig.to_mapping(), "records": list(noisy.records())}
+    (tmp_path / "r.json").write_text(json.dumps(data))
+    command = ["gaze", "predict", str(tmp_path / "r.json"), "-c", str(tmp_path / "c.json")]
+    assert run([*command, "--json", str(tmp_path / "g.json")]) == 0
+    assert "RMS-S2S" in capsys.readouterr().out
+    found = json.loads((tmp_path / "g.json").read_text())
+    stated = found["summary"][0]["quality"]
+    points = np.array([one["point_mm"] for one in found["gaze"]]).reshape(len(exact), 10, 3).swapaxes(0, 1)
+    wanted = quality(points, exact.index.target_mm, exact.index.eye_position_mm + exact.index.head_mm)
+    assert (stated["fixations"], stated["data_loss"]) == (len(exact), 0)
+    assert stated["sd_deg"] == pytest.approx(np.median(wanted.sd_deg), rel=1e-9)
+    assert stated["bcea_deg2"] == pytest.approx(np.median(wanted.bcea_deg2), rel=1e-9)
 
 
 def test_slow_drift_shows_in_sd_and_not_in_s2s():

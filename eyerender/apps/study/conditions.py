@@ -12,18 +12,18 @@ Therefore the report also has the errors of the right eye alone, and those of a 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ...analytic.observer import trace
-from ...base.arrays import Floats, frozen
+from ...base.arrays import Floats
 from ...base.errors import InputError
 from ...eye.spec import EyeSpec
 from ...gaze.estimate import angular_error_deg, binocular_average
 from ...gaze.guestrin import GuestrinEizenman
-from ...gaze.quality import Quality, quality
+from ...gaze.quality import quality
 from ...gaze.regression import Regression
 from ...scene import Scene
 from ...scene.observation import EYES, Observations
@@ -45,7 +45,7 @@ PEOPLE_PRESET, PEOPLE_SEED, PEOPLE = "adults", 0, 4
 FIXED, SHIFTED = "centre fixed", "centre shifts"
 CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
 """Ways in which the pupil widens -> keys of the scene's eye."""
-QUALITY = tuple(field.name for field in fields(Quality))
+QUALITY = ("accuracy_deg", "rms_s2s_deg", "sd_deg")
 
 
 def _with_lens(axis: int) -> str:
@@ -280,19 +280,10 @@ def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
     rng = np.random.default_rng(SEED)
     samples = []
     for _ in range(SAMPLES):
-        frames, points = tracker.points(_noisy(seen, rng))
+        frames, points = tracker.points(seen.with_noise(NOISE_PX, rng))
         samples.append(points)
     found = quality(np.stack(samples), frames.index.target_mm, tracker.from_mm(frames))
     return {name: float(np.nanmean(getattr(found, name))) for name in QUALITY}
-
-
-def _noisy(seen: Observations, rng: np.random.Generator) -> Observations:
-    """Add independent Gaussian noise of `NOISE_PX` to x and y of features."""
-    pupil = seen.pupil.centre_px + rng.normal(0.0, NOISE_PX, seen.pupil.centre_px.shape)
-    glints = seen.glints.xy_px + rng.normal(0.0, NOISE_PX, seen.glints.xy_px.shape)
-    return replace(
-        seen, pupil=replace(seen.pupil, centre_px=frozen(pupil)), glints=replace(seen.glints, xy_px=frozen(glints))
-    )
 
 
 def _eye_with(spec: EyeSpec, paths: str, change: float) -> EyeSpec | None:
