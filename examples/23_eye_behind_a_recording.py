@@ -35,7 +35,7 @@ noise = er.design.FeatureNoise.of(0.05, 0.02, rig=scene.rig)
 fit = er.fit_eye(seen, scene.rig, er.Unknowns.population(), prior="E2", noise=noise)[0]
 found = fit.to_mapping()
 for name, value in found["person"].items():
-    if value["deviation"]:
+    if value["learned"]:
         print(f"{name}: {value['change']:+.3f} +- {value['deviation']:.3f}")
 
 # %%

@@ -211,6 +211,7 @@ def outcome(fit: EyeFit, eye: EyeModel, sights: np.ndarray, warned: bool) -> Out
 def fitted(rig: er.Rig, preset: str, subject: int, seed: int) -> list[Outcome | None]:
     """The outcomes of one person with targets and without; None for a fit that was refused."""
     seen, eye, sights, scene = recording(rig, preset, subject, seed)
+    print(f"{preset} {subject}: {time.process_time():.0f} s", file=sys.stderr, flush=True)
     out: list[Outcome | None] = []
     for targets in (True, False):
         with warnings.catch_warnings(record=True) as caught:

@@ -128,7 +128,10 @@ class Unknowns(Spec):
         }
         return cls.from_mapping({**priors, **fields})
 
-    shaped = population  # its name while `population` had no shapes of cornea and pupil
+    @classmethod
+    def shaped(cls, **fields: Knowledge) -> Self:
+        """Create the priors of `population`; the name is of a time when that had no shapes of cornea and pupil."""
+        return cls.population(**fields)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

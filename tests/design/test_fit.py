@@ -543,6 +543,19 @@ def test_covariances_are_those_of_the_inverse_of_the_whole_matrix():
     assert known.axis_covariance_deg2[3] == pytest.approx(np.degrees(np.degrees(exact[np.ix_(first, first)])), rel=1e-8)
 
 
+def test_what_is_kept_of_many_instants_grows_with_their_number():
+    """160 instants take at most four times as much as 40; a dense matrix of all unknowns would take sixteen times."""
+    size = {}
+    for count in (40, 160):
+        rows = np.random.default_rng(2).normal(size=(count, 40, COUNT))
+        known = eye_information(
+            "right", (np.arange(count), np.zeros(count)), np.swapaxes(rows, 1, 2) @ rows, rows[:, :2],
+            Unknowns.population(),
+        )  # fmt: skip
+        size[count] = sum(np.asarray(getattr(known, name)).nbytes for name in known.__slots__)
+    assert size[160] <= 4.0 * size[40]
+
+
 def test_what_cannot_be_fitted_is_named():
     frames = frames_of("head_mounted", most=2)
     seen = er.trace(frames)
