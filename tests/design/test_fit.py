@@ -618,7 +618,7 @@ def test_the_default_eye_and_priors_are_those_of_drawn_people():
         return np.array([
             radius_of(front[0]), np.mean(front[0].conic_constants), -eye.stop.centre_mm[0], np.arctan2(y, x),
             np.arctan2(z, x), -np.mean(centres), centres[1] - centres[0], *eye.stop.centre_mm[1:], *waves[:, 2],
-            radius_of(front[1]) / radius_of(front[0]) / (6.385 / 7.715),
+            radius_of(front[1]) / radius_of(front[0]) / (6.425 / 7.715),
         ])  # fmt: skip
 
     places = [6, 7, 8, 9, 10, 11, GAP, 17, 18, MARGIN.start, MARGIN.start + 1, POSTERIOR]
@@ -631,4 +631,7 @@ def test_the_default_eye_and_priors_are_those_of_drawn_people():
     away = (np.array([numbers(eye) for eye in eyes]) - numbers(er.load_eye("adult").build(eye="right"))) / stated
     # The mean of 200 is known to .07 and their SD to 5 %, and the eye has rounded numbers.
     assert np.abs(away.mean(axis=0)).max() < 0.34
-    assert np.sqrt(np.mean(away**2, axis=0)) == pytest.approx(1.0, abs=0.25)
+    # The margin's is wider, so that no outline is far from it.
+    wider = np.where(np.isin(places, [MARGIN.start, MARGIN.start + 1]), 1.5, 1.0)
+    assert wider * np.sqrt(np.mean(away**2, axis=0)) == pytest.approx(1.0, abs=0.25)
+    assert np.abs(away).max() < 5.0
