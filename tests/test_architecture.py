@@ -314,7 +314,7 @@ LARGE = {
 POSITIONAL = {
     "Biconic", "BoundaryPixels", "CalibrationErrors", "Descent", "DeviceSurface", "EyeImage", "EyePicture",
     "Finding", "FunctionErrors", "GradientMedium", "GridSurface", "GuestrinEizenman", "LashPlan", "Patch", "Quadric",
-    "Regression", "Scene", "Score", "Stop", "Sums", "Table", "Visible", "ZernikeSurface", "_Table",
+    "Regression", "Scene", "Score", "Stop", "Table", "ZernikeSurface", "_Table",
 }  # fmt: skip
 
 

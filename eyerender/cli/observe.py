@@ -19,6 +19,7 @@ from .options import AtLeastOne, EyeModel, Result, SceneName, Strict
 from .output import Heed, emit, progress
 
 if TYPE_CHECKING:
+    from ..extraction.region import SearchRegion
     from ..extraction.settings import ExtractionSettings
 
 
@@ -78,6 +79,7 @@ def extract(
     order: Literal["right-left", "left-right"] | None = None,
     polarity: Literal["auto", "dark", "bright"] = "auto",
     radius_px: tuple[float, float] | None = None,
+    roi: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     min_confidence: float | None = None,
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     overlay: Path | None = None,
@@ -102,6 +104,8 @@ def extract(
         order: With --eyes 2: the subject's eyes from the left, or from above (default: right-left).
         polarity: Whether the pupil is darker or brighter than the iris.
         radius_px: Smallest and largest semi-axis of the pupil.
+        roi: Part of the image to search, in pixels: X Y WIDTH HEIGHT, or a mask picture that is not black there. With
+            --eyes 2, first the one of the eye on the image's left, then the other.
         min_confidence: Least probability that a pupil is right; others are missing.
         output: File for the records, one per line (JSON lines), or a table (.csv).
         overlay: Draw the results over the images: a folder for images (PNG), or a file for a video (.mp4, .avi or
@@ -123,7 +127,9 @@ def extract(
         if value is not None and eyes != 2:
             raise InputError("belongs to --eyes 2", source=f"--{name}")
     settings = _settings(radius_px, min_confidence, method=method, polarity=polarity, **both)
-    observer = ImageObserver(gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera)
+    observer = ImageObserver(
+        gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera, rois=_rois(roi, eyes)
+    )
     if output is not None:
         refuse_special(output)
         if output.suffix.lower() in (".xlsx", ".xls", ".ods"):
@@ -173,6 +179,21 @@ def _settings(
     except InputError as error:
         option = "--min-confidence" if error.path == "min_confidence" else "--radius-px"
         raise InputError(error.reason, source=option) from None
+
+
+def _rois(values: Sequence[str], eyes: int) -> tuple[SearchRegion, ...]:
+    """Return the regions of each eye from four numbers or a mask picture each; none without values."""
+    from ..folders.imagefile import read_any_image
+
+    if not values:
+        return ()
+    if len(values) == eyes:
+        return tuple(read_any_image(one)[0] for one in values)
+    numbers = [int(one) for one in values if one.isdecimal()]
+    if len(numbers) != len(values) or len(numbers) != 4 * eyes:
+        needed = "X Y WIDTH HEIGHT or a mask picture" + (" for each of two eyes" if eyes == 2 else "")
+        raise InputError(f"must be {needed}, not {' '.join(values)}", source="--roi")
+    return tuple((x, y, w, h) for x, y, w, h in zip(*(numbers[k::4] for k in range(4)), strict=True))
 
 
 def _check_extract(images: Sequence[Path], gamma: float | None, eyes: int) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ..base.arrays import Floats
 from .pipeline import extract
+from .region import SearchRegion
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings
 
@@ -22,11 +23,13 @@ def extract_eyes(
     gamma: float = 1.0,
     settings: ExtractionSettings | None = None,
     prior: tuple[PupilResult | None, PupilResult | None] = (None, None),
+    rois: Sequence[SearchRegion] = (),
 ) -> tuple[Extraction, Extraction]:
     """Extract pupils and glints of both eyes: the subject's right eye, then the left one.
 
-    The arguments are those of `extract`, with one `prior` per eye. The settings say how the image holds the eyes.
-    Positions are relative to the whole image.
+    The arguments are those of `extract`, with one `prior` per eye. The settings say how the image holds the eyes. None
+    or two regions `rois`, that on the image's left or upper side first, take the place of its halves. Positions are
+    relative to the whole image.
     """
     array, own = np.asarray(image), settings or ExtractionSettings()
     axis = 0 if own.arrangement == "stacked" else 1
@@ -34,18 +37,17 @@ def extract_eyes(
         one = extract(array, bit_depth=bit_depth, gamma=gamma, settings=settings)
         none = PupilResult.missing("input", f"the image is too {'narrow' if axis else 'low'} for two eyes")
         return one, replace(one, pupil=none, glints=())
+    height, width = array.shape[:2]
     size, turn = array.shape[axis], -1 if own.order == "left-right" else 1
-    begins = 0, int((0.5 - (OVERLAP if own.arrangement == "face" else 0.0)) * size)
-    ends = size - begins[1], size
-    parts = [array[:, a:b] if axis else array[a:b] for a, b in zip(begins, ends, strict=True)]
-    shifts = [np.array([start, 0.0] if axis else [0.0, start]) for start in begins]
+    half = size - int((0.5 - (OVERLAP if own.arrangement == "face" else 0.0)) * size)
+    halves: Sequence[SearchRegion] = (
+        ((0, 0, half, height), (width - half, 0, half, height))
+        if axis
+        else ((0, 0, width, half), (0, height - half, width, half))
+    )
     left, right = (
-        _moved(
-            extract(part, bit_depth=bit_depth, gamma=gamma, settings=settings, prior=_shifted(before, -shift)),
-            shift,
-            (array.shape[0], array.shape[1]),
-        )
-        for part, shift, before in zip(parts, shifts, prior[::turn], strict=True)
+        extract(array, bit_depth=bit_depth, gamma=gamma, settings=settings, prior=before, roi=region)
+        for before, region in zip(prior[::turn], rois or halves, strict=True)
     )
     if own.arrangement == "face":
         left, right = _apart(left, right, 0.5 * size)
@@ -61,19 +63,3 @@ def _apart(left: Extraction, right: Extraction, middle_px: float) -> tuple[Extra
     if first.centre_px[0] < middle_px:
         return left, replace(right, pupil=other, glints=(), rejected=())
     return replace(left, pupil=other, glints=(), rejected=()), right
-
-
-def _moved(found: Extraction, shift: Floats, shape: tuple[int, int]) -> Extraction:
-    """Shift the result of a part to coordinates of the whole image."""
-    glints, rejected = (
-        tuple(replace(one, xy_px=one.xy_px + shift) for one in several) for several in (found.glints, found.rejected)
-    )
-    pupil = _shifted(found.pupil, shift)
-    assert pupil is not None
-    return replace(found, pupil=pupil, glints=glints, rejected=rejected, shape=shape)
-
-
-def _shifted(pupil: PupilResult | None, shift: Floats) -> PupilResult | None:
-    if pupil is None or pupil.ellipse is None:
-        return pupil
-    return replace(pupil, ellipse=pupil.ellipse.shifted(shift), contour_px=pupil.contour_px + shift)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import Bools, Floats
+from ..base.arrays import Bools, Floats, frozen
 from ..base.jit import ensure_compiled
 from ..optics.ellipse import signed_distance
 from .glints.classification import EyeContext, classify_spots
@@ -26,12 +25,13 @@ from .glints.windows import window_radius
 from .preprocessing import DN, ImagePart, Prepared, prepare
 from .pupil.boundary import PupilCandidate
 from .pupil.consensus import far_off
-from .pupil.covariance import boundary_deviation
+from .pupil.covariance import between
 from .pupil.edge_model import EdgeModel
 from .pupil.glare import NO_PATCH, levels_beside
-from .pupil.refinement import LID, PixelFit, refine
+from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import ScoredCandidate, pupil_of
-from .pupil.search import SURE, find_pupil
+from .pupil.search import find_pupil
+from .region import SearchRegion, cut_region, placed
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings, Shape
 from .statistics import median
@@ -48,6 +48,7 @@ def extract(
     gamma: float = 1.0,
     settings: ExtractionSettings | None = None,
     prior: PupilResult | None = None,
+    roi: SearchRegion | None = None,
 ) -> Extraction:
     """Extract the pupil ellipse and the glints from an image.
 
@@ -64,13 +65,21 @@ def extract(
         settings: settings of the extractor.
         prior: the pupil of the previous frame. The search starts there, and continues elsewhere unless the result is
             certain. A missing pupil is ignored.
+        roi: the part of the image that is searched: (x, y, width, height), or a mask (h, w) that is not 0 there.
+            Coordinates stay those of the whole image.
 
     Returns:
         Pupil and glints. If something is not found, the result has a status and a reason.
 
     Raises:
-        InputError: the array is not an image, or contradicts bit_depth.
+        InputError: the array is not an image, or contradicts bit_depth or roi.
     """
+    if roi is not None:
+        whole = np.asarray(image)
+        part, corner, inside = cut_region(whole, roi)
+        before = None if prior is None else prior.moved((-corner[0], -corner[1]))
+        found = extract(part, bit_depth=bit_depth, gamma=gamma, settings=settings, prior=before)
+        return placed(found, corner, inside, (int(whole.shape[0]), int(whole.shape[1])))
     ensure_compiled()
     settings = settings or ExtractionSettings()
     prepared = prepare(image, bit_depth, gamma)
@@ -79,10 +88,10 @@ def extract(
     if isinstance(prepared, str):
         return _nothing(PupilResult.missing("input", prepared), 0.0, size)
     limits = Shape.of(settings, size)
-    found = find_pupil(prepared, limits, settings.polarity, prior)
-    if isinstance(found, PupilResult):
-        return _nothing(found, prepared.noise_dn / DN, size)
-    return explained(prepared, found, settings)
+    scored = find_pupil(prepared, limits, settings.polarity, prior)
+    if isinstance(scored, PupilResult):
+        return _nothing(scored, prepared.noise_dn / DN, size)
+    return explained(prepared, scored, settings)
 
 
 def _nothing(pupil: PupilResult, noise: float, shape: tuple[int, int]) -> Extraction:
@@ -101,11 +110,12 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
         return _nothing(pupil, noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
     spots, fit = _fit_spots(prepared, found, spots)
-    if refined:
+    share = found.regularity
+    if refined and share > 0.0:
         pixels, fit = _refined(prepared, found, spots, fit)
-        by_pixels = None if pixels is None else pupil_of(scored, pixels, settings)
-        if pixels is not None and by_pixels is not None and _better(by_pixels, pupil):
-            model, pupil = pixels.model, by_pixels
+        if pixels is not None:
+            model = pixels.model if share > 0.5 else model
+            pupil = _blended(pupil, pupil_of(scored, pixels, settings), share)
     if not pupil.ok:
         return _nothing(pupil, noise, size)
     iris, step = _iris_level(prepared, found, model), model.step_dn
@@ -123,23 +133,21 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     return Extraction(pupil=pupil, glints=accepted, rejected=rejected, noise=noise, shape=size)
 
 
-def _better(pixels: PupilResult, edges: PupilResult) -> bool:
-    """Return whether the pupil from the pixel model is as certain as the one from the edges.
+def _blended(edges: PupilResult, pixels: PupilResult, share: float) -> PupilResult:
+    """Blend the pupil from the edges with a share of the one from the pixel model.
 
-    If a lid cuts the outline, its covariance must also be smaller: the lid's shadow reaches the pixels beside the
-    edges.
+    Unlike a choice between the two, a blend does not switch from frame to frame.
     """
-    if pixels.goodness is None or edges.goodness is None:
-        return pixels.ok
-    cut = edges.goodness.gap > LID and _deviation(pixels) > _deviation(edges)
-    return pixels.confidence >= min(edges.confidence, SURE) and not cut
-
-
-def _deviation(pupil: PupilResult) -> float:
-    """Compute the standard deviation of a pupil's boundary, px; infinite if it is missing."""
-    if pupil.ellipse is None or pupil.covariance is None:
-        return math.inf
-    return boundary_deviation(pupil.ellipse, pupil.covariance)
+    if pixels.ellipse is None or pixels.covariance is None:
+        return edges
+    if edges.ellipse is None or edges.covariance is None:
+        return pixels
+    return replace(
+        pixels if share > 0.5 else edges,
+        ellipse=between(edges.ellipse, pixels.ellipse, share),
+        covariance=frozen((1.0 - share) * edges.covariance + share * pixels.covariance),
+        confidence=(1.0 - share) * edges.confidence + share * pixels.confidence,
+    )
 
 
 def _iris_level(prepared: Prepared, found: PupilCandidate, model: EdgeModel) -> float:

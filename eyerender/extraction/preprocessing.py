@@ -20,6 +20,7 @@ MAX_PIXELS = 64_000_000
 MIN_SIDE = 16
 # Lowest level at which a camera clips, in full scales; least pixels that are flat there, and largest share of them.
 WHITEST, FEW_WHITE, MOST_WHITE = 0.8, 6, 0.02
+LEAST_STEPS = 4.0  # blocks of compressed noise differ by three grey levels (JPEG of quality 30)
 DN = 255.0  # grey levels of full scale; every level inside the extractor is in these
 
 
@@ -36,6 +37,7 @@ class Prepared:
         linear: (h, w) float32 linear intensity, full scale 255.
         clip_dn: level at which the sensor saturates; infinite for float images.
         noise_dn: standard deviation of a pixel's noise.
+        least_dn: smallest step that is more than rounding and compression.
         inverted: whether the image is a negative.
         scale: pixels of the whole image per pixel.
     """
@@ -43,17 +45,26 @@ class Prepared:
     linear: Image
     clip_dn: float
     noise_dn: float
+    least_dn: float = 0.0
     inverted: bool = False
-    scale: int = 1
+    scale: float = 1.0
 
-    def reduced(self, scale: int) -> Prepared:
-        """Return the image reduced by the factor `scale`, with its noise at that size."""
-        if scale == 1:
-            return self
-        height, width = (scale * (side // scale) for side in self.linear.shape)
-        size = (width // scale, height // scale)
-        small = as_image(cv2.resize(self.linear[:height, :width], size, interpolation=cv2.INTER_AREA))
-        return replace(self, linear=small, noise_dn=max(estimate_noise(small), self.noise_dn / scale), scale=scale)
+    def rescaled(self, scale: float) -> Prepared:
+        """Return the image reduced by the factor `scale` (below 1: enlarged), with its noise at that size."""
+        size = (int(self.linear.shape[1] / scale), int(self.linear.shape[0] / scale))
+        whole = self.linear[: round(size[1] * scale), : round(size[0] * scale)]
+        method = cv2.INTER_AREA if scale > 1.0 else cv2.INTER_LINEAR
+        return self._with(as_image(cv2.resize(whole, size, interpolation=method)), max(scale, 1.0), scale)
+
+    def smoothed(self, sigma_px: float) -> Prepared:
+        """Return the image smoothed by a Gaussian."""
+        smooth = as_image(cv2.GaussianBlur(self.linear, (0, 0), sigma_px))
+        return self._with(smooth, 2.0 * math.sqrt(math.pi) * sigma_px, 1.0)
+
+    def _with(self, linear: Image, less: float, scale: float) -> Prepared:
+        """Return another image of the same scene: its noise as estimated there, and at least that of white noise."""
+        noise = max(estimate_noise(linear), self.noise_dn / less)
+        return replace(self, linear=linear, noise_dn=noise, scale=scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +118,7 @@ def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | st
     # Sensor noise is added after the wells are full, so clipped pixels scatter slightly below full scale.
     if np.isfinite(clip):
         clip -= min(max(3.0 * noise, 0.004 * DN), 0.02 * DN)
-    return Prepared(linear=linear, clip_dn=clip, noise_dn=noise)
+    return Prepared(linear=linear, clip_dn=clip, noise_dn=noise, least_dn=LEAST_STEPS * quantum)
 
 
 def _checked(image: object) -> NDArray[np.generic]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -30,7 +30,6 @@ class Goodness:
         unevenness: how much darker the pupil's middle is than its outer part, as a share of the step.
         spread: scatter of the grey levels inside the pupil beyond the noise, as a share of the step.
         boundary_sd_px: standard deviation of the boundary's position, averaged along it, from the covariance.
-        uneven_px: standard deviation of the boundary's displacement from the ellipse; 0 if it was not fitted.
         refined: whether the ellipse comes from the pixel model.
         leverage: standard deviation of the boundary, averaged along it, if every sixteenth of the visible outline were
             displaced independently by 1 px: 0.5 to 0.6 for a whole outline, 5 and more for a short arc.
@@ -39,6 +38,7 @@ class Goodness:
         within: edge points inside it, per point that it fits.
         shaded: share of the outline with edge points whose outside is darker than the iris.
         pale: share of the outline with edge points whose inside is brighter than the pupil.
+        covered: share of the inner half of the ellipse that reflections cover.
         mirrored: share of the outline without edge points where a bright inside meets a brighter outside, as below a
             reflection that covers both.
     """
@@ -54,7 +54,6 @@ class Goodness:
     unevenness: float
     spread: float
     boundary_sd_px: float
-    uneven_px: float
     refined: bool
     leverage: float
     open: float = 0.0
@@ -62,6 +61,7 @@ class Goodness:
     within: float = 0.0
     shaded: float = 0.0
     pale: float = 0.0
+    covered: float = 0.0
     mirrored: float = 0.0
 
 
@@ -100,6 +100,13 @@ class PupilResult:
     def missing(stage: Stage, reason: str) -> PupilResult:
         """Create a missing pupil from the stage that failed and the reason."""
         return PupilResult(status=Status.NOT_FOUND, stage=stage, reason=f"{stage}: {reason}")
+
+    def moved(self, shift_px: tuple[int, int]) -> PupilResult:
+        """Add a shift (x, y) to the position."""
+        if self.ellipse is None:
+            return self
+        shift = np.array(shift_px, dtype=np.float64)
+        return replace(self, ellipse=self.ellipse.shifted(shift), contour_px=self.contour_px + shift)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -150,3 +157,11 @@ class Extraction:
     rejected: tuple[GlintResult, ...]
     noise: float
     shape: tuple[int, int]
+
+    def moved(self, shift_px: tuple[int, int]) -> Extraction:
+        """Add a shift (x, y) to all positions."""
+        glints, rejected = (
+            tuple(replace(one, xy_px=one.xy_px + np.array(shift_px)) for one in several)
+            for several in (self.glints, self.rejected)
+        )
+        return replace(self, pupil=self.pupil.moved(shift_px), glints=glints, rejected=rejected)

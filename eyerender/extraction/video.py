@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -16,9 +18,13 @@ from ..base.storage.files import written
 from ..folders.video import VideoFrame, VideoReader
 from .pair import extract_eyes
 from .pipeline import extract
+from .pupil.search import continues
+from .region import SearchRegion
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings
 
+LONGEST_S = 1.0  # blinks close the eye for 0.1 to 0.4 s
+USUAL_HZ = 30.0  # rate of a video that states no times
 # Codec of each kind of file that is written: one that OpenCV's bundled FFmpeg can encode.
 CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
 
@@ -29,23 +35,71 @@ def follow(
     gamma: float = 1.0,
     settings: ExtractionSettings | None = None,
     eyes: int = 1,
+    rois: Sequence[SearchRegion] = (),
 ) -> Iterator[tuple[VideoFrame, tuple[Extraction, ...]]]:
-    """Extract the features of each frame; the search starts at the pupil of the previous frame.
+    """Extract the features of each frame; the search starts where the pupil was last.
+
+    A pupil found elsewhere (`Track`) is missing until it has been there as long as the followed one.
 
     Args:
         frames: frames in temporal order.
         gamma: encoding gamma of the levels.
         settings: settings of the extractor.
         eyes: 1, or 2 for frames with both eyes: the right one, then the left one.
+        rois: the part of the frames that is searched for each eye; empty: all.
     """
-    before: list[PupilResult | None] = [None] * eyes
+    tracks = [Track() for _ in range(eyes)]
     for frame in frames:
+        priors = [track.pupil for track in tracks]
         if eyes == 1:
-            found: tuple[Extraction, ...] = (extract(frame.image, gamma=gamma, settings=settings, prior=before[0]),)
+            region = rois[0] if rois else None
+            one = extract(frame.image, gamma=gamma, settings=settings, prior=priors[0], roi=region)
+            found: tuple[Extraction, ...] = (one,)
         else:
-            found = extract_eyes(frame.image, gamma=gamma, settings=settings, prior=(before[0], before[1]))
-        before = [one.pupil if one.pupil.ok else None for one in found]
-        yield frame, found
+            found = extract_eyes(frame.image, gamma=gamma, settings=settings, prior=(priors[0], priors[1]), rois=rois)
+        time_s = frame.time_s if math.isfinite(frame.time_s) else frame.number / USUAL_HZ
+        yield frame, tuple(track.follow(seen, time_s) for track, seen in zip(tracks, found, strict=True))
+
+
+@dataclass(slots=True)
+class Track:
+    """The pupil that is followed, and another one that was found elsewhere while it was gone.
+
+    In a blink or a wink something else may look like the pupil: a screw, a brow, the other eye. It is followed only
+    after it has been there for as long as the pupil before, or for LONGEST_S.
+
+    Attributes:
+        pupil: the followed pupil where it was last; None before the first.
+        span_s: first and last time at which it was seen.
+        other: the pupil elsewhere.
+        other_s: first time at which it was seen.
+    """
+
+    pupil: PupilResult | None = None
+    span_s: tuple[float, float] = (0.0, 0.0)
+    other: PupilResult | None = None
+    other_s: float = 0.0
+
+    def follow(self, found: Extraction, time_s: float) -> Extraction:
+        """Take the result of the next frame, and return it, without the pupil and glints if they are elsewhere."""
+        if not found.pupil.ok:
+            return found
+        if self.pupil is None or _continues(self.pupil, found.pupil):
+            self.span_s = (time_s if self.pupil is None else self.span_s[0], time_s)
+        else:
+            if self.other is None or not _continues(self.other, found.pupil):
+                self.other_s = time_s
+            self.other = found.pupil
+            if time_s - self.other_s < min(self.span_s[1] - self.span_s[0], LONGEST_S):
+                missing = PupilResult.missing("coarse search", "found far from the pupil of the frames before")
+                return replace(found, pupil=missing, glints=(), rejected=())
+            self.span_s = (self.other_s, time_s)
+        self.pupil, self.other = found.pupil, None
+        return found
+
+
+def _continues(before: PupilResult, found: PupilResult) -> bool:
+    return before.ellipse is not None and found.ellipse is not None and continues(before.ellipse, found.ellipse)
 
 
 class VideoWriter:

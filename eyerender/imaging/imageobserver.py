@@ -25,6 +25,7 @@ from ..extraction.glints.matching import assign_lights, predict_glints
 from ..extraction.overlay import overlay
 from ..extraction.pair import extract_eyes
 from ..extraction.preprocessing import single_threaded
+from ..extraction.region import SearchRegion
 from ..folders.imagefile import image_files, read_any_image, write_png
 from ..folders.imagefolder import METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
@@ -58,6 +59,7 @@ class ImageObserver:
         settings: settings of the extractor; if the rig is known, the range of pupil sizes is narrowed.
         gamma: encoding gamma of the images; 1 is linear.
         camera: number of the scene's camera that took single images and videos; None: the first one.
+        rois: part of single images and videos that is searched for each eye, as in `extract`; empty: all.
         backend: backend that renders the frames.
         threads: number of processor threads for rendering; None: all.
         progress: called with (images done, images in all, "images") after each image.
@@ -66,6 +68,7 @@ class ImageObserver:
     settings: ExtractionSettings = field(default_factory=ExtractionSettings)
     gamma: float = 1.0
     camera: int | None = None
+    rois: tuple[SearchRegion, ...] = ()
     backend: BackendChoice = "auto"
     threads: int | None = None
     progress: Progress | None = None
@@ -96,6 +99,8 @@ class ImageObserver:
         self, folder: ImageFolder, scene: Scene | None = None, *, progress: Progress | None = None
     ) -> Observations:
         """Extract the features of a folder's images, in the order of its records; `scene` replaces their rigs."""
+        if self.rois:
+            raise InputError("is for images of a camera; this folder states the windows of its eyes", path="roi")
         index = folder.truth().index
         rigs = rigs_of(folder) if scene is None else [scene.rig] * len(index)
         return self.observe_entries(folder.entries, index, rigs, progress=progress)
@@ -156,13 +161,15 @@ class ImageObserver:
             folder = ImageFolder.load(paths[0])
             return self.observe_folder(folder, scene, progress=progress)
         paths = files_of(paths)
-        if scene is not None and eyes == 1 and pictures is None and (entries := _rendered(paths)):
+        if scene is not None and eyes == 1 and pictures is None and not self.rois and (entries := _rendered(paths)):
             index = concatenate([entry.truth() for entry in entries]).index
             return self.observe_entries(entries, index, [scene.rig] * len(index), progress=progress)
         if pictures is not None:
             _refuse_inputs([_picture_of(path, pictures) for path in paths], paths)
         gathered, skipped, coloured = Gathering(), list[InputWarning](), 0
-        job = _FileJob(settings=self.settings, gamma=self.gamma, eyes=eyes, pictures=pictures, lenient=lenient)
+        job = _FileJob(
+            settings=self.settings, gamma=self.gamma, eyes=eyes, rois=self.rois, pictures=pictures, lenient=lenient
+        )
         count = processes if len(paths) >= LEAST_FOR_POOL else 1
         with mapper(count, initializer=single_threaded, chunksize=4) as each:
             for k, done in enumerate(followed_by(each(job, paths), len(paths), progress, "images")):
@@ -288,6 +295,7 @@ class _FileJob:
     settings: ExtractionSettings
     gamma: float
     eyes: int
+    rois: tuple[SearchRegion, ...]
     pictures: Path | None
     lenient: bool
 
@@ -304,7 +312,10 @@ class _FileJob:
             "gamma": self.gamma,
             "settings": self.settings,
         }
-        found = extract_eyes(image, **options) if self.eyes == 2 else (extract(image, **options),)
+        if self.eyes == 2:
+            found: tuple[Extraction, ...] = extract_eyes(image, rois=self.rois, **options)
+        else:
+            found = (extract(image, roi=self.rois[0] if self.rois else None, **options),)
         if self.pictures is not None:
             full = float(2**depth - 1) if depth <= 16 else float(max(image.max(), 1e-9))
             picture = overlay(image, found, full)

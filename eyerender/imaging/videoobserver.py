@@ -84,7 +84,9 @@ def observe_video(
         table = output.records is not None and is_table(output.records)
         gathered = Gathering()
         writer: VideoWriter | None = None
-        for frame, found in follow(video, gamma=observer.gamma, settings=observer.settings, eyes=eyes):
+        for frame, found in follow(
+            video, gamma=observer.gamma, settings=observer.settings, eyes=eyes, rois=observer.rois
+        ):
             if output.overlay is not None:
                 if writer is None:
                     height, width = frame.image.shape

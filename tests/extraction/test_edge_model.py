@@ -94,7 +94,7 @@ def test_jacobian_is_the_models_slope(b):
     model, x, y = _leaning(b)
     # One sector per pixel, and a residual of 1 everywhere: the sums of slopes times residual are the slopes.
     each = np.arange(x.size)
-    slopes = Sums.of(BoundaryPixels(x, y, model.level(x, y) + 1.0, each, each), model, np.zeros(x.size)).pull
+    slopes = Sums.of(BoundaryPixels(x, y, model.level(x, y) + 1.0, each, each), model).pull
     for k in range(slopes.shape[0]):
         step = np.zeros(slopes.shape[0])
         step[k] = 1e-5
@@ -191,8 +191,8 @@ def test_second_pass_on_a_textured_iris_with_glints():
 def test_uneven_margin_leaves_no_bias():
     """Margins that deviate from an ellipse by 1 % of its radius (rms), in the third to eighth harmonic.
 
-    What is asked for is the ellipse that fits the whole margin best; the pixel model's finds it to the noise, and says
-    so. Taken for an even one, such a margin costs 0.1 px and more.
+    What is asked for is the ellipse that fits the whole margin best. The pixel model takes such a margin for an even
+    one, which costs 0.1 px and more; the edges find the ellipse to 0.03 px, so the answer is theirs.
     """
     fine, width, height = 8, 112, 104
     t = np.linspace(0.0, 2.0 * np.pi, 3600, endpoint=False)
@@ -215,12 +215,11 @@ def test_uneven_margin_leaves_no_bias():
         blurred = ndimage.gaussian_filter(mask.astype(np.float32), 0.9 * fine).reshape(height, fine, width, fine)
         image = 75.0 - 55.0 * blurred.mean(axis=(1, 3)) + rng.normal(0.0, 1.0, (height, width))
         found = extract(np.rint(image * 200.0).astype(np.uint16)).pupil
-        assert found.goodness.refined
+        assert not found.goodness.refined
         error = found.ellipse.centre_px - best.centre_px
         errors.append(np.hypot(*error))
         distances.append(error @ np.linalg.solve(found.covariance[:2, :2], error))
-    assert np.median(errors) < 0.012
-    assert max(errors) < 0.04
-    # Chi-squared of two degrees of freedom: its median is 1.4, and one of eight is above 14 in 1 %.
-    assert np.median(distances) < 4.0
+    assert np.median(errors) < 0.03
+    assert max(errors) < 0.05
+    # Chi-squared of two degrees of freedom: one of eight is above 14 in 1 %.
     assert max(distances) < 14.0

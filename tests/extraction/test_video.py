@@ -72,6 +72,53 @@ def test_a_wrong_prior_does_no_harm(drawings):
     assert iou(found.ellipse, _truth(drawings[1])) > 0.95
 
 
+def _film(eyes: dict[tuple[float, float], set[int]], screw: bool) -> list[np.ndarray]:
+    """Forty frames (240, 320) of eyes that turn a little, by their place, with the frames in which each is shut.
+
+    A screw is a dark disc of 20 px in the corner, fainter than a pupil.
+    """
+    y, x = np.mgrid[:240, :320].astype(float)
+    rng, frames = np.random.default_rng(3), []
+    for k in range(40):
+        levels = np.full((240, 320), 150.0)
+        if screw:
+            levels -= 50.0 * (np.hypot(x - 34, y - 30) < 10.0)
+        for (cx, cy), shut in eyes.items():
+            at = np.hypot(x - cx - 6.0 * np.sin(0.3 * k), y - cy)
+            if k not in shut:
+                levels = np.where(at < 45.0, 80.0, levels)
+                levels = np.where(at < 18.0, 25.0, levels)
+                levels = np.where(np.hypot(x - cx - 7.0, y - cy + 4.0) < 2.5, 255.0, levels)
+        seen = cv2.GaussianBlur(levels, (0, 0), 1.2) + rng.normal(0.0, 1.5, levels.shape)
+        frames.append(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
+    return frames
+
+
+@pytest.mark.parametrize("shut", [{20, 21, 22, 23, 24}, {6, 7, 8}, {12, 13, 14, 15, 30, 31}])
+def test_a_blink_does_not_give_the_film_to_a_screw_or_to_the_other_eye(shut, tmp_path):
+    films = {
+        "screw": _film({(180.0, 130.0): shut}, True),
+        "wink": _film({(90.0, 120.0): shut, (240.0, 120.0): set()}, False),
+    }
+    for name, frames in films.items():
+        film = (VideoFrame(k, k / 30.0, image, False) for k, image in enumerate(frames))
+        found = [one.pupil for _, (one,) in follow(film)]
+        first = found[0].ellipse.centre_px
+        if name == "wink" and first[0] > 160.0:  # the eye that never shuts
+            shut = set()
+        for k, pupil in enumerate(found):
+            assert pupil.ok == (k not in shut), (name, k)
+            assert not pupil.ok or math.dist(pupil.ellipse.centre_px, first) < 25.0
+
+
+def test_a_new_place_is_followed_once_it_has_lasted():
+    frames = _film({(100.0, 120.0): set()}, False)[:10] + _film({(220.0, 120.0): set()}, False)[:20]
+    found = [one.pupil for _, (one,) in follow(VideoFrame(k, k / 30.0, f, False) for k, f in enumerate(frames))]
+    assert all(one.ok for one in found[:10])
+    assert not any(one.ok for one in found[10:18])
+    assert all(abs(one.ellipse.centre_px[0] - 220.0) < 10.0 for one in found[21:])
+
+
 def test_frames_of_a_lossless_video(video, drawings):
     frames = list(VideoReader(video))
     assert [frame.number for frame in frames] == list(range(len(drawings)))

@@ -19,6 +19,12 @@ from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import Inpainted, inpaint_glints
 from .places import holding
 
+SPOT = 0.5  # share of the step by which a spot in the middle is darker where it may be a small pupil in an iris
+RINGING_DN = 12.0  # darker spots beside a glint than this are not made by compression
+# Unevenness at which the pixel model has half the weight, and its weight below which it is not fitted. Drawn ellipses
+# scatter by up to 0.003 of the radius, also in textured irises; nearly all recorded pupils by 0.005 to 0.016.
+UNEVEN, LEAST_SHARE = 0.004, 0.05
+LID = 0.3  # share of the outline in a gap between edge points that only a lid makes
 ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are detected again, around the boundary
 
 
@@ -65,23 +71,44 @@ class PupilCandidate:
         return 2.8 * float(self.candidate.ellipse.semi_axes_px[0]) + 16.0
 
     @property
+    def regularity(self) -> float:
+        """How regular the boundary is, from 1 (an ellipse to within the noise) to 0; the pixel model's weight.
+
+        It is 1 / (1 + (u / UNEVEN)^6) with the scatter u of the edge points beyond noise, in radii, and falls
+        to 0 where a gap nears LID: the shadow of a lid looks like a shaded iris, which the model follows.
+        """
+        boundary = self.boundary
+        excess = max(boundary.residual_px**2 - 1.3 * boundary.noise_px**2, 0.0)
+        uneven2 = excess / float(boundary.ellipse.semi_axes_px.prod())
+        share = 1.0 / (1.0 + (uneven2 / UNEVEN**2) ** 3)
+        share *= min(max((LID - boundary.gap) / 0.1, 0.0), 1.0)
+        return max(share - LEAST_SHARE, 0.0) / (1.0 - LEAST_SHARE)
+
+    @property
     def core_dn(self) -> float:
         """How much darker the middle is than the outer part, DN; 0 if that is not significant.
 
         Positive if the outline is that of an iris; negative if the pupil in that iris is bright.
         """
-        inside = self.interior
-        limit = max(4.0 * inside.error_dn, 0.15 * self.candidate.step_dn)
-        return inside.darker_dn if abs(inside.darker_dn) > limit else 0.0
+        inside, step = self.interior, self.candidate.step_dn
+        if abs(inside.darker_dn) > max(4.0 * inside.error_dn, 0.15 * step):
+            return inside.darker_dn
+        return inside.spot_dn if inside.spot_dn > max(6.0 * self.image.noise_dn, SPOT * step, RINGING_DN) else 0.0
+
+    @property
+    def outline(self) -> Ellipse:
+        """The boundary in pixels of the whole image."""
+        return enlarged(self.boundary.ellipse, self.image.scale)
 
     def enlarged(self, work: Prepared) -> PupilCandidate:
         """Convert the candidate to pixels of the whole image."""
         edges, boundary, scale = self.edges, self.boundary, self.image.scale
         lengths = np.array([scale, scale, scale, scale, 1.0])
+        candidate = replace(self.candidate, ellipse=enlarged(self.candidate.ellipse, scale))
         return PupilCandidate(
             image=work,
-            inpainted=self.inpainted.enlarged(work.linear, scale),
-            candidate=replace(self.candidate, ellipse=_enlarged(self.candidate.ellipse, scale)),
+            inpainted=_inpainted(work, candidate),
+            candidate=candidate,
             edges=replace(
                 edges,
                 points_px=scale * (edges.points_px + 0.5) - 0.5,
@@ -90,15 +117,17 @@ class PupilCandidate:
             ),
             boundary=replace(
                 boundary,
-                ellipse=_enlarged(boundary.ellipse, scale),
+                ellipse=self.outline,
                 points_px=scale * (boundary.points_px + 0.5) - 0.5,
                 residual_px=scale * boundary.residual_px,
+                noise_px=scale * boundary.noise_px,
                 covariance=boundary.covariance * np.outer(lengths, lengths),
             ),
         )
 
 
-def _enlarged(ellipse: Ellipse, scale: int) -> Ellipse:
+def enlarged(ellipse: Ellipse, scale: float) -> Ellipse:
+    """Convert an ellipse to pixels of which `scale` are one pixel of its image."""
     return Ellipse(scale * (ellipse.centre_px + 0.5) - 0.5, scale * ellipse.semi_axes_px, ellipse.angle_rad)
 
 
@@ -118,10 +147,7 @@ def find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilCa
 
 
 def _find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilCandidate | str:
-    inpainted = Inpainted(work.linear)
-    if not work.inverted:
-        about = (candidate.ellipse, candidate.inside_dn, candidate.step_dn)
-        inpainted = inpaint_glints(work.linear, *about, work.noise_dn)
+    inpainted = _inpainted(work, candidate)
     b = float(candidate.ellipse.semi_axes_px[1])
     sigma = filter_sigma(candidate.step_dn, work.noise_dn, b)
     edges = find_edges(inpainted, candidate, work.noise_dn, sigma, band=0.4)
@@ -134,3 +160,9 @@ def _find_boundary(work: Prepared, candidate: Candidate, shape: Shape) -> PupilC
     if isinstance(boundary, str):
         return boundary
     return PupilCandidate(image=work, inpainted=inpainted, candidate=candidate, edges=edges, boundary=boundary)
+
+
+def _inpainted(work: Prepared, candidate: Candidate) -> Inpainted:
+    if work.inverted:
+        return Inpainted(work.linear)
+    return inpaint_glints(work.linear, candidate.ellipse, candidate.inside_dn, candidate.step_dn, work.noise_dn)

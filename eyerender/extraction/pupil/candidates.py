@@ -34,6 +34,7 @@ DARKER = 0.6
 # second row is taken, from three times that on every third.
 INSIDE_PX = 16.0
 SPOT_PX = 5.0  # radius of the glints that are removed first
+SPECKS = 3  # darkest pixels of a blob that may be noise
 # Contours after which a sweep ends. Eyes have 20 to 2,000 in all its levels; noise and fine texture have tens of
 # thousands, which take half a second.
 MOST_CONTOURS = 5000
@@ -337,12 +338,12 @@ def _mean_about(image: Image, x: float, y: float, box: np.int64) -> float:
 def candidate_at(prepared: Prepared, ellipse: Ellipse) -> Candidate | None:
     """Create a candidate at a known ellipse, with the levels of the image; None if it is not darker inside."""
     about = ellipse.numbers()
-    inside, step = _levels_about(prepared.linear, about)
+    inside, step = levels_about(prepared.linear, about)
     return Candidate(ellipse=ellipse, inside_dn=inside, step_dn=step) if step > prepared.noise_dn else None
 
 
 @compiled("f4[:,::1], UniTuple(f8, 5)")
-def _levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, float]:
+def levels_about(linear: Image, ellipse: tuple[float, ...]) -> tuple[float, float]:
     """Compute the level inside an ellipse (cx, cy, a, b, angle), and the step from its outer part to a ring outside.
 
     They are medians of the means of 3 x 3 pixels along ellipses.
@@ -359,7 +360,7 @@ def _same(first: Floats, second: Floats) -> bool:
     return near and 0.6 < first[2] * first[3] / (second[2] * second[3]) < 1.65
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BlobInterior:
     """Statistics of the pixels inside an ellipse.
 
@@ -367,11 +368,15 @@ class BlobInterior:
         darker_dn: how much darker the middle is than the outer part.
         error_dn: its standard error; infinite if the ellipse is too small.
         spread_dn: scatter of the grey levels beyond the image's noise.
+        covered: share of the inner half that glints covered.
+        spot_dn: how much darker than the median the darkest pixels of the inner half are, but for SPECKS of them.
     """
 
     darker_dn: float
     error_dn: float
     spread_dn: float
+    covered: float
+    spot_dn: float
 
 
 def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> BlobInterior:
@@ -386,13 +391,16 @@ def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noi
     (cx, cy) = ellipse.centre_px.tolist()
     end = min(0.85, 1.0 - 2.5 * blur_px / b)
     every = max(1, int(a / INSIDE_PX))
-    crop, hidden = np.ascontiguousarray(crop[::every, ::every]), np.ascontiguousarray(hidden[::every, ::every])
+    parts = (crop, hidden, inpainted.linear[rows, columns])
+    crop, hidden, raw = (np.ascontiguousarray(one[::every, ::every]) for one in parts)
     about = ((cx - columns.start) / every, (cy - rows.start) / every, a / every, b / every, ellipse.angle_rad)
     darker, core, ring, between = _interior(crop, hidden, about, end)
+    spot, covered = _inner_half(raw, hidden, about)
     spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
+    error = 1.2533 * noise_dn * math.sqrt(1.0 / max(core, 1) + 1.0 / max(ring, 1))
     if end < 0.6 or core < 5 or ring < 5:
-        return BlobInterior(0.0, math.inf, spread)
-    return BlobInterior(darker, 1.2533 * noise_dn * math.sqrt(1.0 / core + 1.0 / ring), spread)
+        darker, error = 0.0, math.inf
+    return BlobInterior(darker_dn=darker, error_dn=error, spread_dn=spread, covered=covered, spot_dn=spot)
 
 
 @compiled("f4[:,::1], b1[:,::1], UniTuple(f8, 5), f8")
@@ -435,6 +443,29 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
     return quantile_of(ring[:n_ring], 0.5) - quantile_of(core[:n_core], 0.5), n_core, n_ring, spread
 
 
+@compiled("f4[:,::1], b1[:,::1], UniTuple(f8, 5)")
+def _inner_half(raw: Image, hidden: Bools, ellipse: tuple[float, ...]) -> tuple[float, float]:
+    """Examine the inner half of an ellipse (cx, cy, a, b, angle), in levels from before glints were replaced.
+
+    Their surroundings, which are replaced too, hide a pupil of a few px.
+
+    Returns:
+        How much darker than the median the darkest pixels are, but for SPECKS, and the share that glints cover.
+    """
+    cx, cy, a, b, angle = ellipse
+    cos, sin = math.cos(angle), math.sin(angle)
+    half, n, covered = np.empty(raw.size), 0, 0
+    for y in range(raw.shape[0]):
+        for x in range(raw.shape[1]):
+            p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
+            if p * p + q * q < 0.25:
+                half[n] = raw[y, x]
+                covered += hidden[y, x]
+                n += 1
+    spot = quantile_of(half[:n], 0.5) - quantile_of(half[:n], SPECKS / n) if n > SPECKS else 0.0
+    return spot, covered / max(n, 1)
+
+
 def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shape: Shape) -> list[Candidate]:
     """Return candidates inside an ellipse (an iris), from a smoothed image because the step may be below the noise."""
     a, b = ellipse.semi_axes_px.tolist()
@@ -447,9 +478,10 @@ def find_inside(prepared: Prepared, inpainted: Inpainted, ellipse: Ellipse, shap
     found = (
         replace(one, ellipse=one.ellipse.shifted((columns.start, rows.start))) for one in find_candidates(inner, shape)
     )
-    return [
-        one
-        for one in found
-        if one.ellipse.area_px2 < 0.75 * ellipse.area_px2
-        and math.dist(one.ellipse.centre_px, ellipse.centre_px) < 0.5 * b
-    ]
+    return [one for one in found if lies_inside(one.ellipse, ellipse)]
+
+
+def lies_inside(inner: Ellipse, outer: Ellipse, most: float = 0.75) -> bool:
+    """Return whether an ellipse is near the middle of another, as a pupil in its iris, and has a share of its area."""
+    near = math.dist(inner.centre_px, outer.centre_px) < 0.5 * float(outer.semi_axes_px[1])
+    return near and inner.area_px2 < most * outer.area_px2

@@ -39,6 +39,7 @@ class BoundaryFit:
         support: share of the outline that they cover.
         gap: share of the outline in the longest stretch without points.
         residual_px: rms distance of the points.
+        noise_px: the same as noise alone would make it.
         sums: sums over the points, for the covariance and the leverage.
         covariance: (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and the hidden part of the outline.
     """
@@ -49,6 +50,7 @@ class BoundaryFit:
     support: float
     gap: float
     residual_px: float
+    noise_px: float
     sums: EdgeSums
     covariance: Floats
 
@@ -74,7 +76,7 @@ def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected
     start = _consensus(edges, candidate, shape, tolerance)
     if start is None:
         return "no ellipse passes through the edges around the darkest blob"
-    return _polished(edges, start, shape, tolerance)
+    return _polished(edges, start, shape, tolerance, expected_noise_px)
 
 
 def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance: float) -> Ellipse | None:
@@ -159,7 +161,7 @@ def _support(points: Floats, normals: Floats, fits: Floats, tolerance: float) ->
     return out
 
 
-def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float) -> BoundaryFit | str:
+def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float, noise_px: float) -> BoundaryFit | str:
     """Select points and refit until the selection settles."""
     begun = np.array(start.numbers())
     count, found, inliers, points, seen = _settled(edges.points_px, edges.normals, begun, edges.sigma_px, tolerance)
@@ -189,6 +191,7 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float)
         support=support,
         gap=gap,
         residual_px=residual,
+        noise_px=noise_px,
         sums=sums,
         covariance=to_axes(covariance, ellipse),
     )

@@ -168,6 +168,14 @@ def reshaped(ellipse: Ellipse, step: Floats) -> Ellipse:
     return Ellipse(np.array([cx + x, cy + y]), np.array([max(mean + apart, 0.5), max(mean - apart, 0.5)]), angle)
 
 
+def between(first: Ellipse, second: Ellipse, share: float) -> Ellipse:
+    """Return the ellipse that lies a share of the way from one to another, in its centre and its shape matrix."""
+    (a, b), (c, d) = first.semi_axes_px.tolist(), second.semi_axes_px.tolist()
+    cos, sin = math.cos(second.angle_rad - first.angle_rad), math.sin(second.angle_rad - first.angle_rad)
+    shape = (c * cos * cos + d * sin * sin - a, c * sin * sin + d * cos * cos - b, (c - d) * cos * sin)
+    return reshaped(first, share * np.array([*(second.centre_px - first.centre_px), *shape]))
+
+
 def leverage(ellipse: Ellipse, sums: EdgeSums) -> float:
     """Compute how far an ellipse through edge points follows displacements of parts of the outline.
 

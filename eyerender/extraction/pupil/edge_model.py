@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Indices
+from ...base.arrays import Floats, Indices
 from ...base.jit import compiled, inlined
 from ...optics.ellipse import Ellipse
 from .places import BLOCK, PLACES, find_places, place_in, sector_at
@@ -48,7 +48,6 @@ class EdgeModel:
         slope: slope of the outer level, DN per px.
         kurtosis: kurtosis of the blur beyond a Gaussian's 0.
         lean: (cos u, sin u) coefficients of the inner level, DN.
-        displaced: (SECTORS,) displacement of the boundary's sectors into the ellipse, px.
     """
 
     ellipse: Ellipse
@@ -58,10 +57,9 @@ class EdgeModel:
     slope: float = 0.0
     kurtosis: float = 0.0
     lean: tuple[float, float] = (0.0, 0.0)
-    displaced: Floats | None = None
 
     def numbers(self) -> Floats:
-        """Return the parameters (11 + 1 + 2 K,) without the displacements.
+        """Return the parameters (11 + 1 + 2 K,).
 
         In order: centre, semi-axes, angle, sigma, inner level, slope, kurtosis, lean (two) and `outer`.
         """
@@ -91,11 +89,8 @@ class EdgeModel:
 
     def level(self, x: Floats, y: Floats) -> Floats:
         """Compute the expected grey level at pixels (x, y) of any shape."""
-        displaced = _EXACT if self.displaced is None else self.displaced
-        return _levels(self.numbers(), displaced, x.ravel(), y.ravel()).reshape(x.shape)
-
-
-_EXACT = np.zeros(0)
+        numbers = self.numbers()
+        return levels_and_slopes(boundary_terms(x.ravel(), y.ravel(), numbers)[1], numbers)[0].reshape(x.shape)
 
 
 class Profile(NamedTuple):
@@ -225,7 +220,7 @@ def local_levels(places: Floats, count: int, numbers: Floats, basis: Floats, out
 
 @compiled("f8[::1], f8[::1], f8[::1]")
 def boundary_terms(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floats]:
-    """Compute what the level at pixels (n,) depends on, except the displacement of the boundary.
+    """Compute what the level at pixels (n,) depends on.
 
     Returns:
         Sectors (n,); distance, curvature, cos u, sin u and the four `Levels` as rows (8, n).
@@ -245,36 +240,13 @@ def boundary_terms(x: Floats, y: Floats, numbers: Floats) -> tuple[Indices, Floa
     return bins, out
 
 
-@compiled("f8[:,::1], f8[::1], f8[::1]")
-def levels_and_slopes(terms: Floats, displaced: Floats, numbers: Floats) -> tuple[Floats, Floats]:
-    """Compute levels (n,) and their derivatives by the distance (n,), from the terms (8, n) of `boundary_terms`.
-
-    The boundary at each pixel is `displaced` (n,) px into the ellipse.
-    """
-    level, slope = np.empty(displaced.size), np.empty(displaced.size)
-    for k in range(displaced.size):
-        distance, at = terms[0, k] + displaced[k], Levels(terms[4, k], terms[5, k], terms[6, k], terms[7, k])
+@compiled("f8[:,::1], f8[::1]")
+def levels_and_slopes(terms: Floats, numbers: Floats) -> tuple[Floats, Floats]:
+    """Compute levels (n,) and their derivatives by the distance (n,), from the terms (8, n) of `boundary_terms`."""
+    level, slope = np.empty(terms.shape[1]), np.empty(terms.shape[1])
+    for k in range(level.size):
+        distance, at = terms[0, k], Levels(terms[4, k], terms[5, k], terms[6, k], terms[7, k])
         profile = profile_at(distance, terms[1, k], numbers[5], numbers[8])
         level[k] = at.inner + at.step * profile.edge + at.within * distance + at.bend * profile.ramp
         slope[k] = at.step * profile.by_distance + at.within + at.bend * profile.ramp_by_distance
     return level, slope
-
-
-def _levels(numbers: Floats, displaced: Floats, x: Floats, y: Floats) -> Floats:
-    """Compute levels (n,) of the model with these parameters; `displaced` is empty for an exact ellipse."""
-    terms, between = boundary_terms(x, y, numbers)[1], np.zeros(x.size)
-    if displaced.size:
-        _, _, cos_u, sin_u, *_ = terms
-        at = (np.arctan2(sin_u, cos_u) / (2.0 * np.pi) + 0.5) * displaced.size - 0.5
-        low = np.floor(at).astype(np.intp)
-        first, second = displaced[low % displaced.size], displaced[(low + 1) % displaced.size]
-        between = first + (at - low) * (second - first)
-    return levels_and_slopes(terms, between, numbers)[0]
-
-
-def longest_gap(held: Bools) -> float:
-    """Compute the share of the outline in the longest run of sectors that are not held; 1 if none is."""
-    at = np.flatnonzero(held)
-    if at.size == 0:
-        return 1.0
-    return float(np.diff(np.append(at, at[0] + held.size)).max() - 1) / held.size

@@ -64,17 +64,6 @@ class Inpainted:
             crop[to], hidden[to] = self.patch[part], self.mask[part]
         return crop, hidden
 
-    def enlarged(self, linear: Image, scale: int) -> Inpainted:
-        """Return the same result at `scale` times the size, for the image `linear` of that size."""
-        if self.patch is None or self.mask is None:
-            return Inpainted(linear)
-        size = (scale * self.patch.shape[1], scale * self.patch.shape[0])
-        mask = cv2.resize(self.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        patch = as_image(cv2.resize(self.patch, size))
-        x, y = scale * self.corner[0], scale * self.corner[1]
-        patch[~mask] = linear[y : y + size[1], x : x + size[0]][~mask]
-        return Inpainted(linear, (x, y), patch, mask)
-
 
 @compiled("UniTuple(f8, 5), f8, f4[:,::1], UniTuple(i8, 2), f4[:,::1]")
 def levels_beside(

@@ -1,9 +1,4 @@
-"""Least squares of the boundary's pixel model: derivatives, normal equations, Gauss-Newton steps.
-
-A pupil boundary is not exactly an ellipse: every sector may be displaced, with a given standard deviation. To first
-order, a displacement is a linear parameter that affects only its sector's pixels, so all displacements are eliminated
-from the normal equations (Schur complement).
-"""
+"""Least squares of the boundary's pixel model: derivatives, normal equations, Gauss-Newton steps."""
 
 from __future__ import annotations
 
@@ -77,68 +72,45 @@ class BoundaryPixels:
         return BoundaryPixels(band.x[chosen], band.y[chosen], band.level[chosen], index, sector)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """Weights of the priors, relative to the weight of a pixel's residual.
+def prior_weights(start: EdgeModel, noise_dn: float, size: int) -> Floats:
+    """Return the weight (size,) of the square of every parameter of a fit that starts from a model.
 
-    These are the weights of the squares of slope, kurtosis, a lean and a harmonic (4,), then the standard deviation of
-    a sector's displacement and the weight of its square (infinite if no displacement is allowed).
+    They are relative to the weight of a pixel's residual: those of the slope, the kurtosis, the lean and the harmonics.
     """
-
-    weights: Floats
-    uneven_px: float
-    displacement: float
-
-    @staticmethod
-    def of(start: EdgeModel, noise_dn: float, uneven_px: float) -> Prior:
-        """Compute the priors of a fit that starts from a model."""
-        displacement = (noise_dn / uneven_px) ** 2 if uneven_px > 0.0 else math.inf
-        step = max(start.step_dn, noise_dn)
-        slope = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1])
-        weights = (noise_dn / np.array([slope, KURTOSIS_SD, LEAN_SD * step, HARMONIC_SD * step])) ** 2
-        return Prior(weights, uneven_px, displacement)
-
-    def of_all(self, size: int) -> Floats:
-        """Return the weight (size,) of every parameter except the displacements."""
-        out = np.zeros(size)
-        out[7], out[8], out[9:11], out[FIXED:] = self.weights
-        return out
+    step, out = max(start.step_dn, noise_dn), np.zeros(size)
+    out[7], out[8] = SLOPE_SD * step / float(start.ellipse.semi_axes_px[1]), KURTOSIS_SD
+    out[9:11], out[FIXED:] = LEAN_SD * step, HARMONIC_SD * step
+    return np.asarray(np.where(out > 0.0, noise_dn / np.where(out > 0.0, out, 1.0), 0.0) ** 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sums:
     """Sums of products of the linearised model over the pixels; p parameters, k sectors with pixels.
 
-    "Slopes" are derivatives of a pixel's level with respect to the parameters, "steepness" the derivative with respect
-    to the distance.
+    "Slopes" are derivatives of a pixel's level with respect to the parameters.
 
     Attributes:
         matrix: (p, p) products of slopes.
         cost: squared residuals.
         pull: (p, k) slopes times residual, per sector.
-        across: (p, k) slopes times steepness, per sector.
-        along: (k,) steepness times residual, per sector.
-        square: (k,) squared steepness, per sector.
     """
 
     matrix: Floats
     cost: float
     pull: Floats
-    across: Floats
-    along: Floats
-    square: Floats
 
     @staticmethod
-    def of(pixels: BoundaryPixels, model: EdgeModel, displaced: Floats) -> Sums:
-        """Compute the sums with sectors `displaced` (k,) px into the ellipse."""
-        return Sums(*_pixel_sums(pixels.x, pixels.y, pixels.level, pixels.index, model.numbers(), displaced))
+    def of(pixels: BoundaryPixels, model: EdgeModel) -> Sums:
+        """Compute the sums."""
+        about = (pixels.x, pixels.y, pixels.level, pixels.index)
+        return Sums(*_pixel_sums(*about, pixels.sector.size, model.numbers()))
 
 
 @inlined
 def _rows(
     places: Floats, profiles: Floats, level: Floats, start: int, count: int, numbers: Floats, out: tuple[Floats, ...]
 ) -> None:  # fmt: skip
-    """Write a block's derivatives of the level by the parameters, residuals, and derivatives by the distance.
+    """Write a block's derivatives of the level by the parameters, and residuals.
 
     Args:
         places: (PLACES,) the places.
@@ -147,8 +119,8 @@ def _rows(
         start: first pixel of the block.
         count: number of pixels in it.
         numbers: (p,) the model (see `EdgeModel.numbers`).
-        out: receives the derivatives (p BLOCK,), parameter after parameter in the order of `numbers`, the residuals
-            (BLOCK,) and the derivatives by the distance (BLOCK,). It ends with scratch memory (2 BLOCK, and LEVELS).
+        out: receives the derivatives (p BLOCK,), parameter after parameter in the order of `numbers`, and the residuals
+            (BLOCK,). It ends with scratch memory (BLOCK, 2 BLOCK, and LEVELS).
     """
     rows, residual, steep, basis, levels = out
     cos, sin, plane = math.cos(numbers[4]), math.sin(numbers[4]), 1.0 / math.sqrt(numbers[2] * numbers[3])
@@ -178,35 +150,27 @@ def _rows(
 
 
 @summing
-def _add_weighted(
-    rows: Floats, begin: int, end: int, residual: Floats, steep: Floats, k: int, pull: Floats, across: Floats
-) -> None:
-    """Add the sums of rows (p, n), weighted by two values, over columns `begin` to `end`, to columns k of (p, q)."""
+def _add_weighted(rows: Floats, begin: int, end: int, residual: Floats, k: int, pull: Floats) -> None:
+    """Add the sums of rows (p, n), weighted by the residuals, over columns `begin` to `end`, to column k of (p, q)."""
     for j in range(rows.shape[0]):
-        first = second = 0.0
+        total = 0.0
         for i in range(begin, end):
-            first += rows[j, i] * residual[i]
-            second += rows[j, i] * steep[i]
-        pull[j, k] += first
-        across[j, k] += second
+            total += rows[j, i] * residual[i]
+        pull[j, k] += total
 
 
-@compiled("f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1]")
+@compiled("f8[::1], f8[::1], f8[::1], i8[::1], i8, f8[::1]")
 def _pixel_sums(
-    x: Floats, y: Floats, level: Floats, index: Indices, numbers: Floats, displaced: Floats
-) -> tuple[Floats, float, Floats, Floats, Floats, Floats]:
+    x: Floats, y: Floats, level: Floats, index: Indices, sectors: int, numbers: Floats
+) -> tuple[Floats, float, Floats]:
     """Compute the parts of `Sums` for the model with these parameters (see `EdgeModel.numbers`)."""
-    ellipse = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
-    sectors, size = displaced.size, numbers.size
+    ellipse, size = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]), numbers.size
     matrix, basis, places, profiles = np.zeros((size, size)), np.empty(2 * BLOCK), np.empty(PLACES), np.empty(PROFILES)
     flat, residual, steep, levels = np.empty(size * BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(LEVELS)
-    rows, pull, across = flat.reshape(size, BLOCK), np.zeros((size, sectors)), np.zeros((size, sectors))
-    along, square, cost = np.zeros(sectors), np.zeros(sectors), 0.0
+    rows, pull, cost = flat.reshape(size, BLOCK), np.zeros((size, sectors)), 0.0
     for start in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - start)
         find_places(ellipse, x, y, start, count, places)
-        for i in range(count):
-            places[i] += displaced[index[start + i]]  # the distance is the first field
         for i in range(count):
             place = place_in(places, i)
             put_profile(profiles, i, profile_at(place.distance, place.curvature, numbers[5], numbers[8]))
@@ -217,95 +181,42 @@ def _pixel_sums(
             k, end = index[start + begin], begin
             while end < count and index[start + end] == k:
                 cost += residual[end] * residual[end]
-                along[k] += steep[end] * residual[end]
-                square[k] += steep[end] * steep[end]
                 end += 1
-            _add_weighted(rows, begin, end, residual, steep, k, pull, across)
+            _add_weighted(rows, begin, end, residual, k, pull)
             begin = end
     for j in range(size):
         for m in range(j):
             matrix[m, j] = matrix[j, m]
-    return matrix, cost, pull, across, along, square
+    return matrix, cost, pull
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class NormalEquations:
-    """Normal equations with the sectors' displacements eliminated.
-
-    Attributes:
-        matrix: (p, p) sum of products of slopes.
-        vector: (p,) sum of slopes times residual.
-        cost: sum of squares.
-        across: (p, k) products of each sector's displacement with the slopes, priors included.
-        along: (k,) products of each displacement with the residual, priors included.
-        inverse: (k,) inverse of each displacement's product with itself, prior included.
-    """
-
-    matrix: Floats
-    vector: Floats
-    cost: float
-    across: Floats
-    along: Floats
-    inverse: Floats
-
-    @staticmethod
-    def of(sums: Sums, displaced: Floats, prior: Prior) -> NormalEquations:
-        """Eliminate the displacements (k,) from the sums."""
-        cost, rest, inverse = sums.cost, np.zeros(displaced.size), np.zeros(displaced.size)
-        if not math.isinf(prior.displacement):
-            inverse = 1.0 / (sums.square + prior.displacement)
-            rest = sums.along - prior.displacement * displaced
-            cost += prior.displacement * float(displaced @ displaced)
-        root = sums.across * np.sqrt(inverse)
-        return NormalEquations(
-            matrix=sums.matrix - root @ root.T,
-            vector=sums.pull.sum(axis=1) - sums.across @ (inverse * rest),
-            cost=cost,
-            across=sums.across,
-            along=rest,
-            inverse=inverse,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """Result of the fit: the model, the displacements (k,) px, and the sums there, up to a last tiny step."""
-
-    model: EdgeModel
-    displaced: Floats
-    sums: Sums
-
-
-def fitted(pixels: BoundaryPixels, model: EdgeModel, displaced: Floats, prior: Prior, steps: int) -> Solution:
+def fitted(pixels: BoundaryPixels, model: EdgeModel, held: Floats, steps: int) -> tuple[EdgeModel, Sums]:
     """Fit the model with at most `steps` damped Gauss-Newton steps (Levenberg).
 
-    The cost is sum r^2 plus the priors. `displaced` (k,) is the start of the displacements.
+    The cost is sum r^2 plus the parameters' squares times the weights `held` (p,).
+
+    Returns:
+        The model, and the sums there, up to a last tiny step.
     """
-    numbers = model.numbers()
-    held, damping = prior.of_all(numbers.size), 1e-4
-    about = (pixels.x, pixels.y, pixels.level, pixels.index)
-    sums = Sums(*_pixel_sums(*about, numbers, displaced))
-    normal = NormalEquations.of(sums, displaced, prior)
-    cost = normal.cost + float(held @ numbers**2)
+    sums, damping = Sums.of(pixels, model), 1e-4
+    cost = sums.cost + float(held @ model.numbers() ** 2)
     for _ in range(steps):
-        parts = (normal.matrix, normal.vector, normal.across, normal.along, normal.inverse)
-        trial, trial_displaced, largest, widened = _trial(parts, held, numbers, displaced, damping)
+        numbers, largest, widened = _trial(sums.matrix, sums.pull.sum(axis=1), held, model.numbers(), damping)
+        trial = EdgeModel.of(numbers)
         if largest < STILL_PX and widened < 10.0 * STILL_PX and damping < 1e-3:
             # Another step would be several times smaller, and a step this small hardly changes the sums.
-            numbers, displaced = trial, trial_displaced
-            break
-        trial_sums = Sums(*_pixel_sums(*about, trial, trial_displaced))
-        trial_normal = NormalEquations.of(trial_sums, trial_displaced, prior)
-        trial_cost = trial_normal.cost + float(held @ trial**2)
+            return trial, sums
+        trial_sums = Sums.of(pixels, trial)
+        trial_cost = trial_sums.cost + float(held @ numbers**2)
         if trial_cost <= cost:
             gained, cost = cost - trial_cost, trial_cost
-            numbers, displaced, sums, normal = trial, trial_displaced, trial_sums, trial_normal
+            model, sums = trial, trial_sums
             damping *= 0.1
             if gained < 1e-7 * cost:
                 break
         else:
             damping = min(max(damping * 30.0, 1e-3), 1e6)
-    return Solution(EdgeModel.of(numbers), displaced, sums)
+    return model, sums
 
 
 @inlined
@@ -342,32 +253,25 @@ def _moved(numbers: Floats, step: Floats) -> Floats:
     return out
 
 
-@compiled("Tuple((f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1])), f8[::1], f8[::1], f8[::1], f8")
+@compiled("f8[:,::1], f8[::1], f8[::1], f8[::1], f8")
 def _trial(
-    normal: tuple[Floats, ...], held: Floats, numbers: Floats, displaced: Floats, damping: float
-) -> tuple[Floats, Floats, float, float]:
+    matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping: float
+) -> tuple[Floats, float, float]:
     """Take one damped step of at most 3 px.
 
     Args:
-        normal: matrix, vector, across, along and inverse of `Normal`.
+        matrix: (p, p) sum of products of slopes.
+        vector: (p,) sum of slopes times residual.
         held: (p,) weights of the priors.
         numbers: (p,) the model (see `EdgeModel.numbers`).
-        displaced: (k,) displacements of the sectors.
         damping: added to the diagonal of the scaled normal matrix.
 
     Returns:
-        The new parameters and displacements, and the step's largest change of the shape and of sigma, px.
+        The new parameters, and the step's largest change of the shape and of sigma, px.
     """
-    matrix, vector, across, along, inverse = normal
     step = _step(matrix, vector, held, numbers, damping)
     largest = largest_size(step[:SHAPE])
     if largest > 3.0:
         for j in range(step.size):
             step[j] *= 3.0 / largest
-    moved = displaced.copy()
-    for k in range(along.size):
-        further = along[k]
-        for j in range(step.size):
-            further -= step[j] * across[j, k]
-        moved[k] += further * inverse[k]
-    return _moved(numbers, step), moved, largest, abs(step[SHAPE])
+    return _moved(numbers, step), largest, abs(step[SHAPE])

@@ -33,6 +33,9 @@ from .refinement import PixelFit
 
 FAST: Literal["fast"] = "fast"
 REFINED: Literal["refined"] = "refined"
+# An ellipse of a few pixels whose inner half reflections cover by this share is never surer than UNSURE: their flanks
+# are as steep as its edge.
+COVERED, UNSURE, FEW_PX = 0.7, 0.85, 14.0
 SCALES = (-2.0, 6.0)  # limits of the logarithm of the covariance's factor
 
 
@@ -54,7 +57,7 @@ def features(ellipse: Ellipse, goodness: Goodness) -> dict[str, float]:
         "unevenness": max(g.unevenness, -0.5),
         "spread": g.spread,
         "ln chi2": math.log(min(max(g.reduced_chi2, 0.3), 100.0)),
-        "uneven / b": g.uneven_px / b,
+        "uneven / b": 0.0,  # of fits that let the boundary deviate, to which the weights were fitted
         "ln leverage": math.log(g.leverage),
         "open": g.open,
         "beyond": min(g.beyond, 2.0),
@@ -68,8 +71,9 @@ def features(ellipse: Ellipse, goodness: Goodness) -> dict[str, float]:
 def confidence(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
     """Compute the probability that IoU > 0.9."""
     table = confidence_table(method)
+    most = UNSURE if goodness.covered > COVERED and ellipse.semi_axes_px[1] < FEW_PX else 1.0
     logit = float(calibrated(_row(ellipse, goodness, method) @ table.logit, table.calibration))
-    return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))
+    return min(1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0))), most)
 
 
 def covariance_scale(ellipse: Ellipse, goodness: Goodness, method: Literal["fast", "refined"]) -> float:
@@ -99,7 +103,7 @@ class ScoredCandidate:
     def enlarged(self, work: Prepared) -> ScoredCandidate:
         """Convert the candidate to pixels of the whole image; the evidence remains that of the reduced one."""
         scale, goodness = self.candidate.image.scale, self.goodness
-        pixels = ("residual_px", "blur_px", "boundary_sd_px", "uneven_px")
+        pixels = ("residual_px", "blur_px", "boundary_sd_px")
         lengths = {name: scale * getattr(goodness, name) for name in pixels}
         return replace(self, candidate=self.candidate.enlarged(work), goodness=replace(goodness, **lengths))
 
@@ -129,8 +133,8 @@ def goodness_of(found: PupilCandidate, fit: PixelFit | None) -> Goodness:
         blur_px=model.sigma_px,
         unevenness=inside.darker_dn / model.step_dn,
         spread=inside.spread_dn / model.step_dn,
+        covered=inside.covered,
         boundary_sd_px=boundary_deviation(ellipse, covariance),
-        uneven_px=0.0 if fit is None else fit.uneven_px,
         leverage=leverage(boundary.ellipse, boundary.sums),
         refined=fit is not None,
         **outline_of(found, ellipse),

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -20,26 +20,33 @@ from ...optics.ellipse import Ellipse, iou
 from ..preprocessing import Prepared, invert
 from ..result import PupilResult
 from ..settings import LEAST_PX, Shape
-from .boundary import PupilCandidate, find_boundary
-from .candidates import Candidate, candidate_at, find_candidates, find_inside
+from .boundary import PupilCandidate, enlarged, find_boundary
+from .candidates import Candidate, candidate_at, find_candidates, find_inside, levels_about, lies_inside
 from .glare import around
 from .scoring import ScoredCandidate, score
 
 SURE = 0.9  # a hypothesis of this confidence ends the search
 LATE_CONFIDENCE = 0.5  # least confidence of a hypothesis of a later pass
 LARGE_PX = 14.0  # pupils from this semi-axis on are found at a quarter of the scale, in a quarter of the time
-SCALES = (1, 2, 4)  # pixels of the image per pixel of the image searched
+SCALES = (2, 4)  # pixels of the image per pixel of the reduced images
+SMOOTH_PX = 1.2  # blur of the smoothed image: that of compression, and little for a pupil of 7 px
+# Seen share of an outline from which on it may be the pupil in an iris, and its largest share of the iris' area (that
+# of a pupil of 8.5 mm).
+SEEN, WIDEST = 1 / 3, 0.5
 LEAST_SIDE = 32  # px of a reduced image
 FEW = 9  # thresholds of the first pass; the edges decide, and later passes use all
 USUAL_PX = 7.0  # smaller pupils are looked for at full resolution and last; lashes and shadows are as small
 # Between two frames a pupil moves by up to a few of its own sizes (a saccade of 500 deg/s covers 4 mm in 1/30 s). Its
 # size changes by less than a third.
-MOVED, GROWN = 4.0, 0.7
+MOVED, GROWN, SPARE_PX = 4.0, 0.7, 8.0
 SAME = 0.95  # candidates of at least this overlap have the same boundary
 LIKELY = 0.5  # share of the best candidate's score below which no later look starts from a candidate
 # Work after which a search ends: boundaries, and the pixels about each in units of this many. That is about 0.1 s on a
 # quiet core. In 1,697 development images, 2 of the right boundaries came after more than 50, none after 60.
 MOST_WORK, PIXELS_OF_UNIT = 60.0, 40_000.0
+# A pupil has more than a fifth of the iris' diameter (2.4 of 12 mm as the cornea shows it) and lies in its middle.
+LEAST_OF_IRIS, CENTRED = 0.2, 0.35
+WHITE = 0.9  # share of the clip level from which on a disc is a reflection
 FLAT = 0.8  # ratio of axes below which a blob may be a pupil that lids cut
 
 
@@ -57,41 +64,87 @@ def find_pupil(
         prior: the pupil of the previous frame, which only decides where the search starts.
     """
     before = None if prior is None else prior.ellipse
-    if prior is not None and prior.bright and polarity == "auto":
-        found = _search(invert(prepared), shape, before)
-        if isinstance(found, ScoredCandidate) and found.confidence >= SURE:
-            return found
     if polarity == "bright":
         return _search(invert(prepared), shape, before)
-    dark = _search(prepared, shape, before)
+    dark = _search(prepared, shape, None if prior is not None and prior.bright else before)
     if polarity == "dark" or not isinstance(dark, ScoredCandidate) or dark.candidate.core_dn >= 0.0:
         return dark
     bright = _search(invert(prepared), shape, before)
-    if not isinstance(bright, ScoredCandidate) or bright.confidence < SURE:
-        return dark
-    large, small = dark.candidate.boundary.ellipse, bright.candidate.boundary.ellipse
-    apart = float(np.hypot(*(large.centre_px - small.centre_px)))
-    return bright if small.area_px2 < large.area_px2 and apart < float(large.semi_axes_px[1]) else dark
+    return bright if isinstance(bright, ScoredCandidate) and _is_bright_pupil(prepared, bright, dark) else dark
+
+
+def _is_bright_pupil(prepared: Prepared, bright: ScoredCandidate, dark: ScoredCandidate) -> bool:
+    """Return whether a bright disc in a dark one is a pupil in its iris, and not a lamp's reflection in a pupil.
+
+    Reflections are smaller than pupils, anywhere in the dark disc, and as bright as the sensor can tell.
+    """
+    iris, pupil = dark.candidate.boundary.ellipse, bright.candidate.boundary.ellipse
+    share = math.sqrt(pupil.area_px2 / iris.area_px2)
+    apart = float(np.hypot(*(iris.centre_px - pupil.centre_px)))
+    level, _ = levels_about(prepared.linear, pupil.numbers())
+    fits = LEAST_OF_IRIS < share < 1.0 and apart < CENTRED * float(iris.semi_axes_px[1])
+    return bright.confidence >= SURE and fits and level < WHITE * prepared.clip_dn
 
 
 def _search(work: Prepared, shape: Shape, prior: Ellipse | None) -> ScoredCandidate | PupilResult:
-    """Return the most likely boundary in an image with a dark pupil.
-
-    The first certain one ends the search. Otherwise the likeliest one of the first pass is returned, unless a later
-    pass finds a likelier one of at least `LATE_CONFIDENCE`.
-    """
+    """Return the most likely boundary in an image with a dark pupil: a certain one near the prior, or the likeliest."""
     if prior is not None:
         for near in _near(work, shape, prior):
-            if isinstance(near, PupilCandidate) and near.core_dn <= 0.0:
+            if isinstance(near, PupilCandidate) and near.core_dn <= 0.0 and continues(prior, near.outline):
                 scored = score(near)
                 if scored.confidence >= SURE:
                     return scored
     return _likeliest(work, shape)
 
 
+def continues(before: Ellipse, found: Ellipse) -> bool:
+    """Return whether a pupil is where an eye may have turned it since the frame before, with about the same size."""
+    apart = math.dist(before.centre_px, found.centre_px)
+    near = apart < MOVED * float(before.semi_axes_px[0]) + SPARE_PX
+    return near and GROWN**2 < found.area_px2 / before.area_px2 < GROWN**-2
+
+
+@dataclass(slots=True)
+class _Outlines:
+    """What a search has found: boundaries to choose from, and outlines in pixels of the whole image.
+
+    Attributes:
+        choices: boundaries that may be the answer.
+        cored: outlines with a darker middle, of an iris, or of a pupil with reflections near its rim.
+        seen: outlines of which a part is seen, which may be the pupil in an iris.
+    """
+
+    choices: list[ScoredCandidate] = field(default_factory=list)
+    cored: list[Ellipse] = field(default_factory=list)
+    seen: list[Ellipse] = field(default_factory=list)
+
+    def add(self, scored: ScoredCandidate, late: bool) -> bool:
+        """Add a boundary; return whether it is certain."""
+        found, outline = scored.candidate, scored.candidate.outline
+        if found.core_dn > 0.0:
+            self.cored.append(outline)
+        if found.boundary.support >= SEEN:
+            self.seen.append(outline)
+        has_core = self._has_core(outline)
+        if scored.confidence >= (LATE_CONFIDENCE if late or has_core else 0.0):
+            self.choices.append(scored)
+        return scored.confidence >= SURE and not has_core
+
+    def best(self) -> ScoredCandidate | None:
+        """Return the likeliest boundary that is not an iris: one with a dark middle that has an outline itself."""
+        for one in sorted(self.choices, key=lambda scored: -scored.confidence):
+            outline = one.candidate.outline
+            if not (self._has_core(outline) and any(lies_inside(other, outline, WIDEST) for other in self.seen)):
+                return one
+        return None
+
+    def _has_core(self, outline: Ellipse) -> bool:
+        return any(_same(outline, one) for one in self.cored)  # a reduced image shows less of the middle
+
+
 def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
-    best: ScoredCandidate | None = None
-    reason, spent = "", 0.0
+    """Return the first certain boundary, else the likeliest one; of later passes it needs `LATE_CONFIDENCE`."""
+    outlines, reason, spent = _Outlines(), "", 0.0
     for late, found in hypotheses(work, shape):
         spent += 1.0
         if spent > MOST_WORK:
@@ -100,15 +153,18 @@ def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
             reason = reason or found
             continue
         spent += found.reach_px**2 / PIXELS_OF_UNIT
+        # A pupil in the enlarged image is as small as the blocks of compression, so its step must be twice as large.
+        if found.candidate.step_dn < work.least_dn / min(found.image.scale, 1.0):
+            reason = reason or "the dark region is as faint as what compression changes"
+            continue
         scored = score(found)
-        late |= found.core_dn > 0.0  # an iris, or a pupil with a reflection in it
-        least = LATE_CONFIDENCE if late else 0.0
-        if scored.confidence > (0.0 if best is None else best.confidence) and scored.confidence >= least:
-            best = scored
-        if scored.confidence >= SURE and not found.core_dn > 0.0:
-            return _at_full_scale(work, scored, shape)
+        if outlines.add(scored, late):
+            return _at_best_scale(work, scored, shape)
+    best = outlines.best()
     if best is not None:
-        return _at_full_scale(work, best, shape)
+        return _at_best_scale(work, best, shape)
+    if outlines.choices:
+        return PupilResult.missing("edges", "only an iris was found, and no certain pupil in it")
     if not reason:
         return PupilResult.missing("coarse search", "no dark round region stands out of its surroundings")
     return PupilResult.missing("edges", reason)
@@ -119,23 +175,23 @@ def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandid
 
     1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
        a dark core
-    2. the same in the image at half and at a quarter of the scale, where texture, block compression and sharpening are
-       finer than the edges, and the spots of a ring light small
+    2. the same in the smoothed image and at half and a quarter of the scale, where noise, texture, block compression
+       and sharpening are finer than the edges, and the spots of a ring light small
     3. pupils that lids cut: circles as wide as flat blobs
-    4. pupils smaller than USUAL_PX
+    4. pupils smaller than USUAL_PX, in the image enlarged twice, where a glint leaves some of their edge
 
     A boundary is in pixels of the scale at which it was found.
     """
     whole: list[Candidate] = []
-    for image, limits in _pyramid(work, shape):
+    for image, limits in _looks(work, shape):
         tried = whole if image is work else []
         usual = replace(limits, least_px=max(limits.least_px, min(USUAL_PX / image.scale, 0.5 * limits.most_px)))
         for candidates in (_large, find_candidates):
             yield from ((image is not work, one) for one in _bounded(image, candidates(image, usual), limits, tried))
     yield from ((True, one) for one in _bounded(work, list(_rounder(whole, shape)), shape, whole))
     if shape.least_px < USUAL_PX:
-        small = replace(shape, most_px=2.0 * USUAL_PX)
-        yield from ((True, one) for one in _bounded(work, find_candidates(work, small), shape, whole))
+        large, small = work.rescaled(0.5), _at_scale(replace(shape, most_px=2.0 * USUAL_PX), 0.5)
+        yield from ((True, one) for one in _bounded(large, find_candidates(large, small), small, []))
 
 
 def _bounded(
@@ -153,25 +209,37 @@ def _bounded(
                 yield find_boundary(work, inner, shape)
 
 
-def _pyramid(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
-    """Return the image at full, half and quarter scale, and the sizes to search for there."""
+def _looks(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
+    """Return the image as it is, smoothed, and at half and quarter scale, and the sizes to search for there."""
+    yield work, shape
+    yield work.smoothed(SMOOTH_PX), shape
     for scale in SCALES:
         if min(work.linear.shape) >= LEAST_SIDE * scale:
-            least = max(shape.least_px / scale, LEAST_PX)
-            yield work.reduced(scale), replace(shape, least_px=least, most_px=shape.most_px / scale)
+            yield work.rescaled(scale), _at_scale(shape, scale)
 
 
-def _at_full_scale(work: Prepared, scored: ScoredCandidate, shape: Shape) -> ScoredCandidate:
-    """Refit a boundary of a reduced image to the edges of the whole image, if the result is as likely."""
-    if scored.candidate.image is work:
-        return scored
-    coarse = scored.enlarged(work)
-    near = candidate_at(work, coarse.candidate.boundary.ellipse)
-    fine = "" if near is None else find_boundary(work, near, shape)
-    if isinstance(fine, PupilCandidate):
-        again = score(fine)
+def _at_scale(shape: Shape, scale: float) -> Shape:
+    return replace(shape, least_px=max(shape.least_px / scale, LEAST_PX), most_px=shape.most_px / scale)
+
+
+def _at_best_scale(work: Prepared, scored: ScoredCandidate, shape: Shape) -> ScoredCandidate:
+    """Refit a boundary of a reduced image, or a small one, to finer edges, if the result is as likely.
+
+    Those are the edges of the whole image, or for pupils below USUAL_PX of the enlarged one.
+    """
+    scale = scored.candidate.image.scale
+    coarse = scored if scored.candidate.image is work else scored.enlarged(work)
+    ellipse = coarse.candidate.boundary.ellipse
+    small = float(ellipse.semi_axes_px[1]) < USUAL_PX
+    if scale <= (0.5 if small else 1.0):
+        return coarse
+    fine, limits = (work.rescaled(0.5), _at_scale(shape, 0.5)) if small else (work, shape)
+    near = candidate_at(fine, enlarged(ellipse, 1.0 / fine.scale))
+    found = "" if near is None else find_boundary(fine, near, limits)
+    if isinstance(found, PupilCandidate):
+        again = score(found)
         if again.confidence >= min(coarse.confidence, SURE):
-            return again
+            return again if fine is work else again.enlarged(work)
     return coarse
 
 
@@ -190,7 +258,7 @@ def _near(work: Prepared, shape: Shape, prior: Ellipse) -> Iterator[PupilCandida
     if candidate is not None:
         yield find_boundary(work, candidate, shape)
     a, b = prior.semi_axes_px.tolist()
-    columns, rows = around(prior.centre_px, MOVED * a + 8.0, work.linear.shape)
+    columns, rows = around(prior.centre_px, MOVED * a + SPARE_PX, work.linear.shape)
     crop = replace(work, linear=np.ascontiguousarray(work.linear[rows, columns]))
     if min(crop.linear.shape) < 16:
         return

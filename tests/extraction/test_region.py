@@ -1,0 +1,109 @@
+"""The part of an image that is searched: rectangles and masks, by the function and by the command."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+import make_ideal_images as ideal
+from eyerender.base.errors import InputError
+from eyerender.cli.main import run
+from eyerender.extraction import extract
+
+SMALL = ideal.Condition(size=(320, 240), semi_axis=(20, 26), noise=(2, 2), aspect=(0.9, 1.0))
+
+
+@pytest.fixture(scope="module")
+def two_eyes():
+    """Two eyes beside each other, (240, 640), and the true centres."""
+    first, second = ideal.draw(SMALL, 20_501), ideal.draw(SMALL, 20_502)
+    centres = [np.add(one.label["pupil"]["centre_px"], (x, 0.0)) for one, x in ((first, 0.0), (second, 320.0))]
+    return np.hstack([first.image, second.image]), centres
+
+
+@pytest.fixture
+def file(two_eyes, tmp_path):
+    path = tmp_path / "eyes.png"
+    assert cv2.imwrite(str(path), two_eyes[0])
+    return path
+
+
+def _mask(columns: slice) -> np.ndarray:
+    mask = np.zeros((240, 640), np.uint8)
+    mask[:, columns] = 255
+    return mask
+
+
+def test_a_rectangle_chooses_the_eye_and_keeps_the_coordinates(two_eyes):
+    image, centres = two_eyes
+    for centre, x in zip(centres, (0, 320), strict=True):
+        found = extract(image, roi=(x, 0, 320, 240))
+        assert np.hypot(*(found.pupil.ellipse.centre_px - centre)) < 0.1
+        assert found.shape == (240, 640)
+        alone = extract(np.ascontiguousarray(image[:, x : x + 320]))
+        np.testing.assert_allclose(
+            found.pupil.ellipse.centre_px, np.add(alone.pupil.ellipse.centre_px, (x, 0.0)), atol=1e-9
+        )
+        assert [g.xy_px.tolist() for g in found.glints] == [np.add(g.xy_px, (x, 0.0)).tolist() for g in alone.glints]
+
+
+def test_a_mask_of_any_shape(two_eyes):
+    image, centres = two_eyes
+    y, x = np.mgrid[:240, :640]
+    for centre in centres:
+        near = np.hypot(x - centre[0], y - centre[1]) < 90.0
+        found = extract(image, roi=near)
+        assert np.hypot(*(found.pupil.ellipse.centre_px - centre)) < 0.1
+        assert all(near[tuple(np.rint(glint.xy_px[::-1]).astype(int))] for glint in found.glints)
+        # Where the mask hides the eye, there is none, though its border cuts through the iris.
+        assert not extract(image, roi=~near & (np.abs(x - centre[0]) < 150.0)).pupil.ok
+
+
+def test_the_command_takes_rectangles_and_mask_pictures(file, two_eyes, tmp_path):
+    out = tmp_path / "out.jsonl"
+    left, right = tmp_path / "left.png", tmp_path / "right.png"
+    assert cv2.imwrite(str(left), _mask(slice(0, 320)))
+    assert cv2.imwrite(str(right), _mask(slice(320, 640)))
+    both = ["0", "0", "320", "240", "320", "0", "320", "240"]
+    for options, centres in (
+        (["--roi", "320", "0", "320", "240"], two_eyes[1][1:]),
+        (["--roi", str(left)], two_eyes[1][:1]),
+        (["--eyes", "2", "--roi", str(left), str(right)], two_eyes[1]),
+        (["--eyes", "2", "--roi", *both], two_eyes[1]),
+    ):
+        assert run(["extract", str(file), "-o", str(out), *options]) == 0
+        records = [json.loads(line) for line in out.read_text().splitlines()]
+        found = [one["pupil"]["centre_px"] for one in records]
+        np.testing.assert_allclose(found, centres, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        (["1", "2", "3"], "must be X Y WIDTH HEIGHT or a mask picture"),
+        (["0", "0", "700", "240"], "is not inside the image of 640 x 240 px"),
+        (["0", "0", "0", "240"], "is not inside the image"),
+        (["-5", "0", "20", "240"], ""),
+        (["missing.png"], "missing.png"),
+    ],
+)
+def test_a_wrong_region_ends_with_one_line(values, reason, file, tmp_path, capsys):
+    out = tmp_path / "out.jsonl"
+    assert run(["extract", str(file), "-o", str(out), "--roi", *values]) == 2
+    error = capsys.readouterr().err
+    assert reason in error
+    assert "Traceback" not in error
+    assert not out.exists()
+
+
+def test_masks_of_another_size_and_empty_ones_are_refused(two_eyes):
+    with pytest.raises(InputError, match="has the shape"):
+        extract(two_eyes[0], roi=np.ones((10, 10)))
+    for wrong in ((1, 2, 3), (0.5, 0.0, 20.0, 20.0), "left", [[[1]]]):
+        with pytest.raises(InputError, match="must be"):
+            extract(two_eyes[0], roi=wrong)
+    with pytest.raises(InputError, match="is empty"):
+        extract(two_eyes[0], roi=np.zeros((240, 640)))
