@@ -56,8 +56,8 @@ def test_rows_state_unit_range_default_and_source():
     assert (lid.kind, lid.range, lid.default, lid.source) == ("number", "≥ 0.6, ≤ 1", "`0.9`", "Becker")
     assert rows["Sensor", "pixel_pitch_um"].unit == "µm"
     assert rows["Panel", "radiance_w_m2_sr"].unit == "W/(m² sr)"
-    assert rows["Rig", "cameras"].range == "1 to 100 entries"
-    assert rows["Rig", "cameras"].default == "**required**"
+    assert rows["Rig", "cameras"].range == "0 to 100 entries"
+    assert rows["Camera", "resolution_px"].default == "**required**"
     assert rows["Led", "position_mm"].kind == "3 of number"
 
 

@@ -30,6 +30,7 @@ def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
 def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
     yield from _texts(scene, "ambient", "map", "file")
     yield from _texts(scene, "rig", "cameras", "calibration", "file")
+    yield from _texts(scene, "rig", "calibration", "file")
     yield from _texts(scene, "region", "head", "texture")
     for name in _texts(scene, "region", "head", "file"):
         yield name

@@ -116,7 +116,7 @@ def load_rig(path: str | Path) -> RigGeometry:
 
 def is_rig_file(path: str | Path) -> bool:
     """Return whether a file is that of a rig, not of a scene."""
-    return Path(path).suffix.lower() in (".yaml", ".yml") and "cameras" in read_yaml(path)
+    return Path(path).suffix.lower() in (".yaml", ".yml") and bool({"cameras", "calibration"} & read_yaml(path).keys())
 
 
 def _read(text: str, source: str) -> tuple[list[Any], Any]:

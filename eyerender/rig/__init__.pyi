@@ -20,5 +20,7 @@ from .rig import RigGeometry as RigGeometry
 from .rig import RigLike as RigLike
 from .screen import ScreenPlane as ScreenPlane
 from .surroundings import paint as paint
+from .unit import UnitCalibration as UnitCalibration
+from .unit import write_unit as write_unit
 
 __all__: list[str]

@@ -84,6 +84,12 @@ _LENS = {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"
 _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
+def is_rotation(R: ArrayLike) -> bool:
+    """Return whether a matrix (3, 3) is a rotation, to 1e-6."""
+    m = np.array(R)
+    return np.allclose(m @ m.T, np.eye(3), atol=1e-6) and bool(np.linalg.det(m) > 0)
+
+
 class CameraCalibration(Spec):
     """Calibration of a camera in OpenCV's form: x_cam = R x_world + t."""
 
@@ -91,11 +97,13 @@ class CameraCalibration(Spec):
     R: Matrix3 = Field(description="rotation, world to camera")
     t_mm: Vec3 = Field(description="translation, world to camera")
     distortion: Distortion = Field(default=(0, 0, 0, 0, 0), description=_DISTORTION)
+    valid_radius: Positive | None = Field(
+        default=None, description="radius sqrt(x'^2 + y'^2) without distortion up to which the lens was measured"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        R = np.array(self.R)
-        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+        if not is_rotation(self.R):
             raise ValueError("R must be a rotation matrix")
         K = np.array(self.K)
         if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or K[2, 2] != 1 or K[0, 0] <= 0 or K[1, 1] <= 0:
@@ -324,7 +332,8 @@ class Camera(Spec):
             return self.resolved().unmirrored()
         if self.calibration is not None:
             c = self.calibration
-            return PinholeCamera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
+            camera = PinholeCamera.of(c.K, c.R, c.t_mm, self.resolution_px, c.distortion, self.name)
+            return replace(camera, reach=c.valid_radius or np.inf)
         width, height = self.resolution_px
         if self.focal_length_px is not None:
             fx = fy = self.focal_length_px
@@ -362,6 +371,7 @@ class PinholeCamera(ArrayValue):
         flip: whether the stored picture is turned left to right. K, distortion and `mirrored` are then those of the
             stored picture; `unflipped` is the camera before the flip.
         relative_illumination: (n, 2) angles from the axis (deg) and shares, in place of the projection's fall-off.
+        reach: radius of the coordinates of `plane` up to which the lens was measured; beyond it there is no picture.
     """
 
     K: Floats
@@ -374,6 +384,7 @@ class PinholeCamera(ArrayValue):
     eyes: tuple[Side, ...] | None = None
     flip: bool = False
     relative_illumination: Floats | None = None
+    reach: float = np.inf
 
     @classmethod
     def of(
@@ -392,8 +403,8 @@ class PinholeCamera(ArrayValue):
     @classmethod
     def from_labels(cls, data: Mapping[str, Any]) -> PinholeCamera:
         """Create the camera of an image from `labels.camera`."""
-        size = tuple(data["resolution_px"])
-        camera = cls.of(data["K"], data["R"], data["t_mm"], (size[0], size[1]), data["distortion"])
+        width, height = data.get("resolution_px") or (1, 1)
+        camera = cls.of(data["K"], data["R"], data["t_mm"], (width, height), data.get("distortion") or (0, 0, 0, 0, 0))
         camera = replace(camera, mirrored=data.get("mirrored") is True)
         return camera.flipped() if data.get("flip") else camera
 
@@ -540,10 +551,7 @@ class PinholeCamera(ArrayValue):
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
     def flattened(self, pixel: ArrayLike) -> PinholeCamera:
-        """Return a camera at the same place without distortion; that of a fisheye looks along the ray of a pixel (2,).
-
-        `ideal` gives its pixels.
-        """
+        """Return a camera without distortion, whose pixels `ideal` gives; a fisheye's looks along a pixel's ray."""
         flat = replace(self, distortion=frozen(np.zeros(5)))
         if not self.is_fisheye:
             return flat
@@ -567,27 +575,23 @@ class PinholeCamera(ArrayValue):
         return np.asarray(points @ self.R[2] + self.t[2])
 
     def stretch(self, cosine: Floats) -> Floats:
-        """Compute the area in the coordinates of `plane` per solid angle, from cosines of angles to the axis.
-
-        1 / cos^3 of a pinhole; theta / sin theta of a fisheye.
-        """
+        """Compute the area in `plane` per solid angle from cosines to the axis: 1 / cos^3, or theta / sin theta."""
         return np.asarray(1 / np.sinc(np.arccos(np.clip(cosine, -1, 1)) / np.pi) if self.is_fisheye else 1 / cosine**3)
 
     def glint_falloff(self, pixels: Floats) -> Floats:
-        """Compute the share of a point's light at pixels (n, 2) per light that the lens' `stretch` spreads there.
+        """Compute the share of a point's light at pixels (n, 2), per light that `stretch` spreads there.
 
-        The aperture appears by the cosine narrower, so it is cos^4 of a pinhole and cos(theta) sin(theta) / theta of a
-        fisheye. With `relative_illumination`, which multiplies the whole picture, it is the distortion's area D.
+        The aperture appears by the cosine narrower, so it is cos^4, or cos(theta) sin(theta) / theta of a fisheye. With
+        `relative_illumination`, which multiplies the whole picture, it is the distortion's area D.
         """
         if self.relative_illumination is not None:
             return np.asarray(distorted_area(*self.undistorted(pixels), self.distortion))
         cosine = self.rays(pixels) @ self.axis
         return np.asarray(np.maximum(cosine, 0) / self.stretch(cosine) if self.is_fisheye else cosine**4)
 
-    def illumination(self, window: Window) -> Floats | float:
-        """Compute the relative illumination (h, w) of a window's pixels by `relative_illumination`; 1 without it."""
-        if self.relative_illumination is None:
-            return 1.0
+    def illumination(self, window: Window) -> Floats:
+        """Compute the relative illumination (h, w) of a window's pixels by `relative_illumination`."""
+        assert self.relative_illumination is not None
         x0, y0, width, height = window
         v, u = np.mgrid[y0 : y0 + height, x0 : x0 + width]
         angle = np.degrees(np.arccos(np.clip(self.rays(np.stack([u, v], axis=-1)) @ self.axis, -1, 1)))
@@ -630,7 +634,7 @@ class PinholeCamera(ArrayValue):
     @property
     def fold(self) -> tuple[float, float]:
         """Radius beyond which a radial distortion images nothing, without and with it; inf if it images everything."""
-        return fold_radius(self.distortion)
+        return fold_radius(self.distortion, self.reach)
 
     def without_rays(self, window: Window) -> Bools | None:
         """Return which pixels (h, w) of a window lie beyond the fold of the lens; None if none does."""

@@ -188,10 +188,11 @@ def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[
     return np.where(bad, np.nan, x), np.where(bad, np.nan, y)
 
 
-def fold_radius(k: Floats) -> tuple[float, float]:
+def fold_radius(k: Floats, most: float = np.inf) -> tuple[float, float]:
     """Compute the radius beyond which the radial part of a lens images nothing, without and with distortion.
 
-    There r g(r^2) has its first maximum or pole; inf if it has none. A fisheye ends at `FARTHEST_RAD` at the latest.
+    There r g(r^2) has its first maximum or pole; inf if it has none. A lens ends at the radius `most` at the latest,
+    and a fisheye at `FARTHEST_RAD`.
     """
     if is_fisheye(k):
         above, below = np.array([1.0, *k[:4]]), np.ones(1)
@@ -202,7 +203,7 @@ def fold_radius(k: Floats) -> tuple[float, float]:
     s = np.polynomial.Polynomial([0.0, 1.0])
     found = np.concatenate([((n + 2 * s * n.deriv()) * m - 2 * s * n * m.deriv()).roots(), m.roots()])
     r2 = float(found.real[(np.abs(found.imag) < 1e-12) & (found.real > 0)].min(initial=np.inf))
-    reach = min(r2**0.5, FARTHEST_RAD) if is_fisheye(k) else r2**0.5
+    reach = min(r2**0.5, most, FARTHEST_RAD if is_fisheye(k) else np.inf)
     if reach == np.inf:
         return np.inf, np.inf
     with np.errstate(divide="ignore"):

@@ -1,8 +1,7 @@
 """Read camera calibrations written by OpenCV, ROS, Kalibr and scripts.
 
-OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON. ROS writes `camera_info` in YAML,
-Kalibr a `camchain.yaml` whose keys are cameras. All of them are read as plain data, without OpenCV; so are YAML, JSON
-and .npz files of scripts, with the usual names.
+OpenCV's `cv2.FileStorage` writes YAML (with a special header and tags), XML or JSON, ROS `camera_info` in YAML, Kalibr
+YAML whose keys are cameras. All are read as plain data, like YAML, JSON and .npz files of scripts with the usual names.
 A key that may describe the lens and is not read is an error: half a calibration moves features by pixels.
 """
 
@@ -34,9 +33,9 @@ _DISTORTION = (
     "distortion", "dist", "d", "kc",
 )  # fmt: skip
 _ROTATION = ("r", "rotation", "rotationmatrix", "rvec", "rotationvector")
-_TRANSLATION = ("t", "tvec", "translation", "translationvector")
+_TRANSLATION = ("t", "tmm", "tvec", "translation", "translationvector")
 _SIZES = (("imagewidth", "imageheight"), ("width", "height"))
-_SIZE = ("imagesize", "size", "resolution", "cameraresolution", "imgsize")
+_SIZE = ("imagesize", "size", "resolution", "cameraresolution", "imgsize", "resolutionpx")
 _MODEL = ("distortionmodel", "cameramodel", "camtype", "model")
 _FOCAL = ("fx", "fy", "cx", "cy")
 # What the writers state beside the lens: OpenCV's calibration programs, ROS, Pupil Labs, and common scripts in Python.
@@ -54,8 +53,7 @@ _UNNAMED = (
     "four coefficients in a column, without a model, may be a fisheye's; add distortion_model: fisheye, or plumb_bob "
     "for a pinhole"
 )
-_MODELS = ("plumbbob", "rationalpolynomial", "rational", "pinhole", "radtan", "radial", "brownconrady", "opencv",
-           "none", "")  # fmt: skip
+_MODELS = ("plumbbob", "rationalpolynomial", "pinhole", "radtan", "radial", "brownconrady", "opencv", "none", "")
 _FISHEYES = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kb4")
 
 
@@ -98,8 +96,7 @@ def _one_camera(found: dict[str, Any], camera: str | None, source: str) -> dict[
     """Return the keys of one camera of a file whose keys are cameras, or those of the file."""
     cameras = {key: value for key, value in found.items() if isinstance(value, dict) and "intrinsics" in value}
     if camera is not None and camera not in cameras:
-        raise InputError(f"holds no camera {shown(camera)}, only {shown(', '.join(cameras) or 'one without a name')}",
-                         source=source)  # fmt: skip
+        raise InputError(f"holds no camera {shown(camera)}, only {shown(', '.join(cameras))}", source=source)
     if camera is None and len(cameras) > 1:
         raise InputError(f"holds {', '.join(cameras)}; say which, by camera: {min(cameras)}", source=source)
     return cameras[camera or next(iter(cameras))] if cameras else found
@@ -275,7 +272,7 @@ def _own(key: str, value: Any, problems: Problems) -> Floats:
     try:
         return coefficients_of(kind.from_mapping(value))
     except InputError as error:
-        problems.add(error.reason, f"{key}.{error.path}" if error.path else key)
+        problems.add(error.reason, f"{key}.{error.path}")
         return np.zeros(5)
 
 
@@ -289,8 +286,7 @@ def _model(data: dict[str, tuple[str, Any]], problems: Problems) -> str | None:
         elif plain in _MODELS:
             found = found or "pinhole"
         else:
-            problems.add(f"the model {shown(model)} is not supported; plumb_bob, rational_polynomial and fisheye are",
-                         named)  # fmt: skip
+            problems.add(f"the model {shown(model)} is not supported; plumb_bob and fisheye are", named)
     _, fisheye = data.get("fisheyemodel", ("", None))
     return found if fisheye is None else ("fisheye" if fisheye != 0 else found or "pinhole")
 

@@ -187,8 +187,8 @@ def fold_warnings(
         apexes = np.array([apex + _PUPIL_REACH_MM for _, apex in views[c]]).reshape(-1, 3)
         x, y, _ = camera.plane(apexes @ camera.R.T + camera.t)
         outside = np.hypot(x, y) > reach
-        ends = reach == FARTHEST_RAD
-        what = "ends the picture at 110 degrees," if ends else "folds the picture back"
+        ends = reach in (FARTHEST_RAD, camera.reach)
+        what = "ends the picture" if ends else "folds the picture back"
         reason = f"{what} {limit * camera.K[0, 0]:.0f} px from the principal point; "
         if outside.any() or any(one is not None and one.all() for one in dark):
             raise InputError(f"{reason}an eye lies beyond", path=camera_paths[c])

@@ -12,11 +12,12 @@ from pydantic import Field, model_validator
 
 from ..base.arrays import ArrayValue, Bools, Ints
 from ..base.errors import InputError
-from ..base.spec import Side, Spec
+from ..base.spec import KeyProblem, Side, Spec
 from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import Mount
 from .screen import Screen, ScreenPlane
+from .unit import UnitCalibration
 
 # Every camera has its own frame for every target and head position.
 MAX_CAMERAS = 100
@@ -30,11 +31,15 @@ class Rig(Spec):
     (640, 480)
     """
 
-    cameras: Annotated[tuple[Camera, ...], Field(min_length=1, max_length=MAX_CAMERAS)] = Field(
-        description="the cameras; each takes frames of its own"
+    cameras: Annotated[tuple[Camera, ...], Field(max_length=MAX_CAMERAS)] = Field(
+        default=(), description="the cameras; each takes frames of its own"
     )
-    lights: Annotated[tuple[Led, ...], Field(min_length=1, max_length=MAX_LIGHTS)] = Field(
-        description="the infrared LEDs; all of them are on in every frame, and light the eyes that they name"
+    lights: Annotated[tuple[Led, ...], Field(max_length=MAX_LIGHTS)] = Field(
+        default=(),
+        description="the infrared LEDs; all of them are on in every frame, and light the eyes that they name",
+    )
+    calibration: UnitCalibration | None = Field(
+        default=None, description="the cameras and LEDs of a device from its file, before those of `cameras`, `lights`"
     )
     screen: Screen | None = Field(default=None, description="the screen that holds the targets")
     mount: Mount | None = Field(
@@ -43,6 +48,11 @@ class Rig(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.calibration is not None:
+            return self  # the whole rig is checked when the file is read
+        for name in ("cameras", "lights"):
+            if not getattr(self, name):
+                raise KeyProblem(name, "needs at least 1 entries" if name in self.model_fields_set else "missing")
         for i, light in enumerate(self.lights):
             if light.ring is not None and light.ring.camera >= len(self.cameras):
                 raise ValueError(f"lights.{i}.ring.camera: there is no camera {light.ring.camera}")
@@ -68,7 +78,7 @@ class Rig(Spec):
         Raises:
             InputError: there is no such light, or a value does not fit.
         """
-        leds = self._single_leds(number)
+        leds = self.single_leds(number)
         moved = np.asarray(changes.pop("moved_mm", (0.0, 0.0, 0.0)), dtype=float)
         leds[number] = {**leds[number], **changes}
         leds[number]["position_mm"] = np.asarray(leds[number]["position_mm"], dtype=float) + moved
@@ -84,7 +94,7 @@ class Rig(Spec):
         Raises:
             InputError: there is no such light, or there are too many.
         """
-        leds = self._single_leds(number)
+        leds = self.single_leds(number)
         place = np.asarray(leds[number]["position_mm"], dtype=float) + np.asarray(moved_mm, dtype=float)
         return self._with_leds([*leds, {**leds[number], "position_mm": place.tolist()}])
 
@@ -94,7 +104,7 @@ class Rig(Spec):
         Raises:
             InputError: there is no such light, or it is the only one.
         """
-        leds = self._single_leds(number)
+        leds = self.single_leds(number)
         return self._with_leds([*leds[:number], *leds[number + 1 :]])
 
     def without_camera(self, number: int) -> Self:
@@ -106,7 +116,7 @@ class Rig(Spec):
         if not 0 <= number < len(self.cameras):
             raise InputError(f"there is no camera {number}, only {len(self.cameras)}", path="cameras")
         cameras = [*self.cameras[:number], *self.cameras[number + 1 :]]
-        return self._with_leds(self._single_leds(0), cameras=cameras)
+        return self._with_leds(self.single_leds(), cameras=cameras)
 
     def of_eye(self, side: Side) -> Self:
         """Return the rig that one eye meets: cameras that see it and LEDs that light it; rings become single LEDs.
@@ -119,13 +129,13 @@ class Rig(Spec):
         if not any([camera.eyes for camera in self.cameras] + [led.eyes for led in self.lights]):
             return self
         cameras = [camera for camera in self.cameras if serves(camera.eyes, side)]
-        leds = [led for led in self._single_leds(0) if serves(led.get("eyes"), side)]
+        leds = [led for led in self.single_leds() if serves(led.get("eyes"), side)]
         for name, kept, verb in (("cameras", cameras, "sees"), ("lights", leds, "lights")):
             if not kept:
                 raise InputError(f"none {verb} the {side} eye", path=f"rig.{name}")
         return self._with_leds(leds, cameras=cameras)
 
-    def _single_leds(self, number: int) -> list[dict[str, Any]]:
+    def single_leds(self, number: int = 0) -> list[dict[str, Any]]:
         """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
@@ -144,17 +154,24 @@ class Rig(Spec):
         return type(self).from_mapping({**kept, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
-        """Return the rig with its cameras' calibration files read in; paths are relative to `base`.
+        """Return the rig with calibration files of the device and its cameras read in; paths are relative to `base`.
 
         Raises:
             InputError: a file cannot be read, or does not fit its camera.
         """
+        if self.calibration is not None:
+            own, leds = self.calibration.read(base)
+            kept = {key: value for key, value in self.to_mapping().items() if key != "calibration"}
+            kept |= {"cameras": [*own, *kept["cameras"]], "lights": [*leds, *kept["lights"]]}
+            return type(self).from_mapping(kept, source=self.calibration.file).resolved(base)
         cameras = tuple(camera.resolved(base) for camera in self.cameras)
         changed = any(new is not old for new, old in zip(cameras, self.cameras, strict=True))
         return self.model_copy(update={"cameras": cameras}) if changed else self
 
     def build(self) -> RigGeometry:
         """Build the numeric rig."""
+        if self.calibration is not None:
+            return self.resolved().build()
         cameras = tuple(camera.build() for camera in self.cameras)
         # A ring of LEDs surrounds the real camera, not its mirror image.
         places = tuple(camera.unmirrored() for camera in self.cameras)

@@ -199,7 +199,9 @@ class Scene:
             InputError: an eye of the person is physically impossible.
         """
         if (authored := spec.rig.resolved(base)) is not spec.rig:
-            spec = spec.model_copy(update={"rig": authored})
+            device, spec = spec.rig.calibration, spec.model_copy(update={"rig": authored})
+            if device is not None:
+                spec = SceneSpec.from_mapping(spec.to_mapping(), source=source)  # whose checks need all cameras
         built = spec.rig.build() if rig is None else rig
         if spec.sensor.exposure_ms is None:
             spec = spec.model_copy(update={"sensor": _exposed(spec, built)})

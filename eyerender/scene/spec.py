@@ -259,7 +259,8 @@ class SceneSpec(FileSpec):
             raise ValueError("give either targets or poses")
         if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
             raise ValueError("targets on a screen need rig.screen")
-        self._check_size()
+        if self.rig.calibration is None:  # else once its file is read
+            self._check_size()
         self._check_response()
         if self.image.window_px is not None:
             for i, camera in enumerate(self.rig.cameras):

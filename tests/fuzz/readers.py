@@ -156,6 +156,25 @@ def _opencv_xml_seeds() -> list[bytes]:
     return [text.encode()]
 
 
+def _unit(path: Path) -> Any:
+    from eyerender.rig.rig import Rig
+
+    placed = {"calibration": {"file": str(path)}, "lights": [{"position_mm": [30, 0, 0]}]}
+    return Rig.from_mapping(placed).build()
+
+
+def _unit_seeds() -> list[bytes]:
+    pose = {"R": np.eye(3).tolist(), "t": [0.0, 0.0, 40.0]}
+    camera = {"name": "a", "K": [[300, 0, 200], [0, 300, 200], [0, 0, 1]], "image_size": [400, 400], **pose}
+    device = {"cameras": [{**camera, "distortion": {"model": "fisheye", "k": [0.1, 0, 0, 0]}, "eyes": ["left"]}]}
+    lens = {"ModelType": "CALIBRATION_LensDistortionModelRational6KT"}
+    lens |= {"ModelParameters": [0.5, 0.5, 0.6, 0.6, *[0.1] * 6, 0, 0, 0, 0, 1.7]}  # type: ignore[dict-item]
+    rt = {"Rotation": np.eye(3).ravel().tolist(), "Translation": [0, 0, 0.04]}
+    windows = {"Intrinsics": lens, "Rt": rt, "SensorWidth": 400, "SensorHeight": 400, "Location": "HT0"}
+    both = device | {"leds": [[30, 0, 0], {"position_mm": [30, 9, 0], "aim_mm": [0, 0, 0]}]}
+    return [json.dumps(one).encode() for one in (both, {"CalibrationInformation": {"Cameras": [windows]}})]
+
+
 def _topography(layout: str) -> Callable[[Path], Any]:
     def read(path: Path) -> Any:
         from eyerender.eye.parts import TopographySpec
@@ -317,6 +336,7 @@ READERS: dict[str, Reader] = {
     "opencv-yaml": Reader("a.yaml", _opencv, _opencv_yaml_seeds),
     "opencv-xml": Reader("a.xml", _opencv, _opencv_xml_seeds),
     "opencv-npz": Reader("a.npz", _opencv, _opencv_npz_seeds),
+    "unit": Reader("a.json", _unit, _unit_seeds),
     "topography-points": Reader("a.csv", _topography("points"), _points_seeds),
     "topography-matrix": Reader("a.csv", _topography("matrix"), _matrix_seeds),
     "ply": Reader("a.ply", _head, _mesh("ply")),

@@ -66,10 +66,6 @@ class GlintTable(ArrayValue):
     share: Floats
     visible: Bools
 
-    def flipped(self, last: int) -> GlintTable:
-        """Return the glints in an image turned left to right, whose last column is `last`."""
-        return replace(self, xy_px=frozen(np.array([last, 0]) + self.xy_px * (-1, 1)))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LampSpots(ArrayValue):

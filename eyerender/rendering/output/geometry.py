@@ -68,16 +68,6 @@ class Geometry(ArrayValue):
                 values[name][covered] = FRAME if name == "instances" else np.nan
         return replace(self, **{name: sealed(value) for name, value in values.items()})
 
-    def flipped(self) -> Geometry:
-        """Return it turned left to right, with normals in the frame of the turned picture."""
-        values: dict[str, Any] = {}
-        for name in ("depth", "normals", "iris_coordinates", "instances"):
-            own = getattr(self, name)
-            if own is not None:
-                sign = (-1, 1, 1) if name == "normals" else 1
-                values[name] = frozen((own * np.array(sign, own.dtype))[:, ::-1], own.dtype)
-        return replace(self, **values)
-
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Hits(ArrayValue):

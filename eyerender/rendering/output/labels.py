@@ -44,10 +44,6 @@ class PartLabels(ArrayValue):
         np.copyto(part, FRAME, where=covered)
         return replace(self, part=sealed(part))
 
-    def flipped(self) -> PartLabels:
-        """Return the labels turned left to right."""
-        return PartLabels(*(frozen(parts[:, ::-1], np.uint8) for parts in (self.part, self.amodal)))
-
     def visible_fraction(self, part: int) -> float:
         """Compute the visible share of a part's amodal pixels in the window; NaN if there are none."""
         whole = int(np.count_nonzero(self.amodal == part))

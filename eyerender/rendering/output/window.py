@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,23 +55,26 @@ class RenderedWindow(ArrayValue):
     geometry: Geometry | None = None
 
     def flipped(self, camera: PinholeCamera) -> RenderedWindow:
-        """Return the window turned left to right; `camera` is that before the flip."""
+        """Return the window turned left to right, with normals in its own frame; `camera` is that before the flip."""
         last = camera.resolution_px[0] - 1
-        margins = self.lid_margins_px
-        return replace(
-            self,
-            window=camera.turned(self.window),
-            irradiance=frozen(self.irradiance[:, ::-1], np.float32),
-            dn=frozen(self.dn[:, ::-1], np.uint16),
-            labels=None if self.labels is None else self.labels.flipped(),
-            glints=self.glints.flipped(last),
-            purkinje=tuple((order, table.flipped(last)) for order, table in self.purkinje),
-            lid_margins_px=None
-            if margins is None
-            else {lid: [[last - x, y] for x, y in points] for lid, points in margins.items()},
-            highlights=None if self.highlights is None else frozen(self.highlights[:, ::-1], np.bool_),
-            geometry=None if self.geometry is None else self.geometry.flipped(),
-        )
+
+        def turned(value: Any) -> Any:
+            """Turn pictures, records of pictures, and tables of glints."""
+            if isinstance(value, GlintTable):
+                return replace(value, xy_px=frozen(np.array([last, 0]) + value.xy_px * (-1, 1)))
+            if isinstance(value, PartLabels | Geometry):
+                return replace(value, **{f.name: turned(getattr(value, f.name)) for f in fields(value)})
+            if value is None:
+                return None
+            sign = (-1, 1, 1) if value.shape[2:] == (3,) else 1  # of normals
+            return frozen(value[:, ::-1] * np.array(sign, value.dtype), value.dtype)
+
+        names = ("irradiance", "dn", "labels", "glints", "highlights", "geometry")
+        lids = {lid: [[last - x, y] for x, y in points] for lid, points in (self.lid_margins_px or {}).items()}
+        others = tuple((order, turned(table)) for order, table in self.purkinje)
+        changed: dict[str, Any] = {name: turned(getattr(self, name)) for name in names}
+        window = camera.turned(self.window)
+        return replace(self, window=window, purkinje=others, lid_margins_px=lids or None, **changed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,7 +197,7 @@ class RawFrame(ArrayValue):
 def _framed(picture: Singles, lens: Lens, camera: PinholeCamera, window: Window) -> Singles:
     """Compute the image (height, width) of a window behind fall-off, vignetting and openings; the input may change."""
     if camera.relative_illumination is not None:
-        picture *= np.asarray(camera.illumination(window), dtype=np.float32)
+        picture *= camera.illumination(window).astype(np.float32)
     if lens.vignetting > 0:
         picture *= defocus.vignette(lens, camera, window)
     return np.asarray(stray.framed(picture, lens, camera, window))
