@@ -180,7 +180,7 @@ def test_headsets_of_windows_mixed_reality(tmp_path):
         ({"cameras": [{**device()["cameras"][0], "distorsion": [0.1]}]}, "cameras.0.distorsion: may describe the lens"),
         ({**device(), "leds": [[1, 2]]}, "leds.0.position_mm: must be a vector of 3 numbers"),
         ({**device(), "led": []}, "led: unknown key; a device has cameras and leds"),
-        ({**device(), "leds": []}, "unit.json: lights: missing"),
+        ({**device(), "leds": []}, "unit.json: lights: needs at least 1 entries"),
         (windows(Rt={}), "CalibrationInformation.Cameras.0: is no camera of Windows Mixed Reality"),
         (windows(Intrinsics={"ModelType": "theta", "ModelParameters": []}), "the model 'theta' is not supported"),
         (
