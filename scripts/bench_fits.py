@@ -18,7 +18,10 @@ import sys
 import time
 import tracemalloc
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 from _bench import Report, options_of, row, single_threaded
 
@@ -53,14 +56,15 @@ from eyerender.design.unknowns import (
 from eyerender.design.varied import radius_of, stacked_eyes, tangents, varied_eyes
 from eyerender.eye.batch import take_eyes
 from eyerender.eye.model import EyeModel
-from eyerender.eye.pose import rigid_motion
+from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.optics.surfaces_biconic import Biconic
 from eyerender.optics.transforms import direction_of
 from eyerender.scene.observation import concatenate
 
 PRESETS = ("adults", "emmetropic_adults", "myopes", "children", "elderly")
 SLIPPAGE_MM, FIXATION_DEG, PLACE_MM = 3.0, 0.3, np.array([0.0, -31.5, 0.0])
-GRID_DEG = [(a, e) for e in (14, 0, -14) for a in (-18, 0, 18)] + [(a, e) for e in (-7, 7) for a in (-9, 9)]
+GRID_DEG = [(a, e) for e in (14.0, 0.0, -14.0) for a in (-18.0, 0.0, 18.0)]
+GRID_DEG += [(a, e) for e in (-7.0, 7.0) for a in (-9.0, 9.0)]
 ELLIPSE_95, AXIS_95 = 5.991, 1.960  # of a squared length in two dimensions, and of a number
 TUNED = 1000  # seeds of people from here on are for choosing priors
 
@@ -114,7 +118,8 @@ def recording(
     parts, sights = [], []
     for k, frame in enumerate(frames):
         seen, eye = er.trace(frame, boundary_points=30), frame.scene.eye("right")
-        turn, _ = rigid_motion(frame.pose, eye)
+        pose = frame.pose
+        turn, _ = rigid_motion(Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad), eye)
         sights.append(turn[0] @ eye.chief_ray.direction)
         n = len(seen)
         index = replace(
@@ -128,7 +133,7 @@ def recording(
 def noisy(seen: er.Observations, rng: np.random.Generator) -> er.Observations:
     """Add the noise that `fit_eye` assumes by default: 0.1 px for a px of outline, 0.05 px for a glint."""
     points = seen.pupil.points_px
-    normal, length = outline_normals(points, np.isfinite(points).all(axis=2))
+    normal, length = outline_normals(points, np.asarray(np.isfinite(points).all(axis=2)))
     with np.errstate(divide="ignore", invalid="ignore"):
         points = points + (0.1 * rng.standard_normal(length.shape) / np.sqrt(length))[..., None] * normal
     glints = seen.glints.xy_px + 0.05 * rng.standard_normal(seen.glints.xy_px.shape)
@@ -139,12 +144,12 @@ def numbers_of(eye: EyeModel, prior: EyeModel) -> np.ndarray:
     """The unknowns (35,) that lead from one right eye to another one; NaN for those that have no one value."""
     out, (a, b) = np.zeros(COUNT), (eye, prior)
 
-    def between(function: object) -> object:
-        return function(a) - function(b)  # type: ignore[operator]
+    def between(function: Callable[[Any], Any]) -> Any:
+        return function(a) - function(b)
 
     def sight(one: EyeModel) -> np.ndarray:
         x, y, z = one.chief_ray.direction
-        return np.arctan2([y, z], x)
+        return np.asarray(np.arctan2([y, z], x))
 
     def ratio(one: EyeModel) -> float:
         return float(radius_of(one.front[1]) / radius_of(one.front[0]))
@@ -165,7 +170,7 @@ def numbers_of(eye: EyeModel, prior: EyeModel) -> np.ndarray:
     shape = np.zeros(COUNT)
     shape[PUPIL] = 2.0 * np.sqrt(np.prod(a.stop.semi_axes_mm))
     for _ in range(5):  # each harmonic is that of the unknown, but for products of small numbers
-        missing = (harmonics(a) - harmonics(take_eyes(varied_eyes(stacked_eyes([b]), shape[None]), 0))).T
+        missing = (harmonics(a) - harmonics(take_eyes(varied_eyes(stacked_eyes([b]), shape[None]), np.array(0)))).T
         shape[ELLIPTICITY] += missing[0]
         shape[MARGIN] += missing[1:].ravel()
     out[ELLIPTICITY], out[MARGIN] = shape[ELLIPTICITY], shape[MARGIN]
@@ -177,7 +182,7 @@ def toricity(surface: Biconic) -> np.ndarray:
     """Half the difference of a biconic's radii, straight and oblique part."""
     angle = np.arctan2(surface.rotation[2, 1], surface.rotation[1, 1])
     half = 0.5 * (surface.radii_mm[0] - surface.radii_mm[1])
-    return half * np.array([np.cos(2 * angle), np.sin(2 * angle)])
+    return np.asarray(half * np.array([np.cos(2 * angle), np.sin(2 * angle)]))
 
 
 def harmonics(eye: EyeModel) -> np.ndarray:
@@ -259,9 +264,9 @@ def cost_rows(report: Report) -> None:
     for count in (250, 1000):
         many = seen.take(np.arange(count) % len(seen))
         many = replace(many, index=replace(many.index, frame=np.arange(count), fixation=np.arange(count)))
-        work = {
-            "predict": lambda many=many: calibrated.predict_rays(many, scene.rig),
-            "fit_eye": lambda many=many: er.fit_eye(many, scene.rig),
+        work: dict[str, Callable[[], object]] = {
+            "predict": partial(calibrated.predict_rays, many, scene.rig),
+            "fit_eye": partial(er.fit_eye, many, scene.rig),
         }
         for name, function in work.items():
             start = time.process_time()

@@ -449,7 +449,7 @@ def restarted(problem: Problem, theta: Floats) -> Floats | None:
 def badness(problem: Problem, theta: Floats) -> Floats:
     """Sum the unexplained part of each instant's features and its distance from the priors, (i,)."""
     off = (theta - problem.centre)[:, :LOCAL] ** 2 * problem.precision[:LOCAL]
-    return unexplained(problem, theta) + off.sum(axis=1)
+    return np.asarray(unexplained(problem, theta) + off.sum(axis=1))
 
 
 def directions_of(problem: Problem, theta: Floats) -> Floats:

@@ -397,7 +397,10 @@ def _cause(name: str, before: Floats, after: Floats, eye: Ints) -> Cause:
     parts = displacement(paired, after, eye)
     net = (_size(after).mean(axis=0) - _size(before).mean(axis=0)).ravel()
     mean, low, high = mean_interval(net)
-    squares = {name: getattr(parts, name) for name in ("rms", "shift", "pattern", "scatter")}
+    squares: dict[str, Any] = {name: getattr(parts, name) for name in ("rms", "shift", "pattern", "scatter")}
+    figures: dict[str, Any] = {f"{part}_deg": root(square) for part, (square, _) in squares.items()}
+    for part, (_, ends) in squares.items():
+        figures[f"{part}_interval_deg"] = None if ends is None else (root(ends[0]), root(ends[1]))
     return Cause(
         name=name,
         frames=len(net),
@@ -406,11 +409,7 @@ def _cause(name: str, before: Floats, after: Floats, eye: Ints) -> Cause:
         net_deg=mean,
         net_low_deg=low,
         net_high_deg=high,
-        **{f"{part}_deg": root(square) for part, (square, _) in squares.items()},
-        **{
-            f"{part}_interval_deg": None if ends is None else (root(ends[0]), root(ends[1]))
-            for part, (_, ends) in squares.items()
-        },
+        **figures,
     )
 
 

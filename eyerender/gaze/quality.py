@@ -78,7 +78,9 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
         steps = angular_error_deg(samples[1:], samples[:-1], from_mm)
         spread = np.where(here, angular_error_deg(samples, mean, from_mm), 0.0)
         middle = np.broadcast_to(mean - from_mm, samples.shape).reshape(-1, 3)
-        away = error_vectors_deg((_unit(samples - from_mm)).reshape(-1, 3), middle).reshape(*samples.shape[:2], 2)
+        way = np.asarray(samples - from_mm).reshape(-1, 3)
+        way = way / np.linalg.norm(way, axis=1, keepdims=True)
+        away = error_vectors_deg(way, middle).reshape(*samples.shape[:2], 2)
         away = np.where(here[..., None], away, 0.0)
         covariance = np.einsum("snx,sny->nxy", away, away) / (count - 1)[:, None, None]
         size = -2.0 * np.log(1.0 - BCEA_SHARE) * np.pi
@@ -93,7 +95,3 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
             ),
             data_loss=frozen(1.0 - count / len(samples)),
         )
-
-
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

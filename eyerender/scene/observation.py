@@ -181,10 +181,15 @@ WHITE = math.sqrt(2.0)
 
 
 class PixelNoise(Protocol):
-    """Noise of features, such as `er.design.FeatureNoise`: px of outline (cameras,), of glints (cameras, lights)."""
+    """Noise of features, such as `er.design.FeatureNoise`."""
 
-    outline_px: Floats
-    glint_px: Floats
+    @property
+    def outline_px(self) -> Floats:
+        """Deviation of one px of outline, (cameras,) px."""
+
+    @property
+    def glint_px(self) -> Floats:
+        """Deviation of each glint, (cameras, lights) px."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -443,7 +443,7 @@ def test_a_second_camera_does_no_harm():
     lights = [er.Led(position_mm=(16.0, -31.5 + 22 * np.cos(a), 22 * np.sin(a))) for a in angle]
     worst = []
     for cameras in ([camera(-53.5)], [camera(-53.5), camera(-14.0)]):
-        rig = er.Rig(cameras=cameras, lights=lights)
+        rig = er.Rig(cameras=tuple(cameras), lights=tuple(lights))
         ((scene, seen),) = people(rig, [0], seed=0)
         (fit,) = fit_eye(seen, scene.rig)
         target = seen.index.target_mm[np.unique(fit.instant, return_index=True)[1]]
@@ -532,7 +532,7 @@ def test_covariances_are_those_of_the_inverse_of_the_whole_matrix():
     gaze = np.zeros((4, 2, COUNT))
     gaze[:, [0, 1], [0, 1]] = 1.0
     matrices = np.swapaxes(rows, 1, 2) @ rows
-    known = eye_information("right", (np.arange(4), np.zeros(4)), matrices, gaze, unknowns)
+    known = eye_information("right", (np.arange(4), np.arange(4)), matrices, gaze, unknowns)
     assert set(known.unseen) == {"kappa_nasal", "kappa_up", "pupil"}
     assert np.isinf(known.person_deviation[KAPPA.start - LOCAL : KAPPA.stop - LOCAL]).all()
     assert np.isinf(known.frame_deviation[:, PUPIL]).tolist() == [False, False, False, True]
@@ -549,7 +549,7 @@ def test_what_is_kept_of_many_instants_grows_with_their_number():
     for count in (40, 160):
         rows = np.random.default_rng(2).normal(size=(count, 40, COUNT))
         known = eye_information(
-            "right", (np.arange(count), np.zeros(count)), np.swapaxes(rows, 1, 2) @ rows, rows[:, :2],
+            "right", (np.arange(count), np.arange(count)), np.swapaxes(rows, 1, 2) @ rows, rows[:, :2],
             Unknowns.population(),
         )  # fmt: skip
         size[count] = sum(np.asarray(getattr(known, name)).nbytes for name in known.__slots__)

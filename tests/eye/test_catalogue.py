@@ -14,7 +14,7 @@ from eyerender.base.errors import InputError
 from eyerender.base.status import Status
 from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, load_eye
 from eyerender.eye.parts import GradientLensSpec
-from eyerender.eye.pose import rigid_motion
+from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.spec import EyeSpec
 from eyerender.optics.surfaces_biconic import Biconic
 from eyerender.optics.surfaces_quadric import Quadric
@@ -227,10 +227,10 @@ def test_the_keratoconus_is_a_cone_on_the_cornea_of_e4(surface, height, radius, 
 def test_the_artificial_eye_shows_its_stop_where_it_is():
     """No refraction: the outline in the image is the stop's own, projected, and the line of sight is the axis."""
     camera = er.Camera.looking_at((0, -31.5, 0), position_mm=(60, -20, -25), focal_length_px=800, size_px=(640, 480))
-    rig = er.Rig(cameras=[camera], lights=[er.Led((60, -40, -25))])
+    rig = er.Rig(cameras=(camera,), lights=(er.Led((60, -40, -25)),))
     frames = er.Subject.one_eye(er.Eye("artificial"), at_mm=(0, -31.5, 0)).looking([(-12, 9)], rig)
     seen, eye = er.trace(frames, boundary_points=24), frames.scene.eye("right")
-    turn, shift = rigid_motion(frames.pose, eye)
+    turn, shift = rigid_motion(Poses(frames.pose.azimuth_rad, frames.pose.elevation_rad, frames.pose.torsion_rad), eye)
     stop = eye.stop.boundary(24) @ turn[0].T + shift[0] + [0, -31.5, 0]
     pixels, _ = frames.scene.rig.cameras[0].project(stop[None])
     assert seen.pupil.points_px == pytest.approx(pixels, abs=1e-6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -196,7 +197,7 @@ def test_noise_alone_reads_zero_and_what_is_planted_is_found():
     for _ in range(60):
         for k, truth in enumerate((np.zeros_like(planted), planted)):
             px = [(truth + rng.normal(0, 0.08, truth.shape)) / DEG_PER_PX for _ in range(20)]
-            steps = {"estimator": exact, "noise": [moved(exact, one) for one in px]}
+            steps: dict[str, Any] = {"estimator": exact, "noise": [moved(exact, one) for one in px]}
             noise = er.gaze.budget(steps, scene.rig, Known(exact), calibration=[0]).cause("noise")
             ends = np.array([noise.shift_interval_deg, noise.pattern_interval_deg])
             # The planted pattern of the 14 frames that are tested, less their mean.
