@@ -347,9 +347,7 @@ def fit_one(
         try:
             _ = found.spec
         except InputError as error:
-            raise InputError(
-                f"the features lead to an eye that cannot exist ({error})", path=f"{found.eye} eye"
-            ) from None
+            raise InputError(f"the {found.eye} eye's features lead to an eye that cannot exist ({error})") from None
     return found
 
 
@@ -359,11 +357,10 @@ def _refuse_strange(problem: Problem, theta: Floats) -> None:
     off[:LOCAL] = 0.0
     worst = int(np.argmax(off))
     if off[worst] > MOST_DEVIATIONS:
-        side = problem.views.eyes.side
         raise InputError(
-            f"the features lead to a {NAMES[worst]} that is {off[worst]:.1f} standard deviations of its prior off; the "
-            "rig, the positions of the eyes or the priors are wrong", path=f"{side} eye",
-        )  # fmt: skip
+            f"the {problem.views.eyes.side} eye's features lead to a {NAMES[worst]} that is {off[worst]:.1f} standard "
+            "deviations of its prior off; the rig, the places of the eyes, the noise or the priors are wrong"
+        )
 
 
 def problem_of(
