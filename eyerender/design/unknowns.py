@@ -113,12 +113,12 @@ class Unknowns(Spec):
         """
         priors: dict[str, Knowledge] = {
             "slippage_mm": 3.0,
-            "corneal_radius_mm": 0.27,
+            "corneal_radius_mm": 0.28,
             "asphericity": 0.12,
             "pupil_depth_mm": 0.42,
-            "kappa_deg": 1.4,
+            "kappa_deg": 1.45,
             "rotation_depth_mm": 0.65,
-            "toricity_mm": 0.045,
+            "toricity_mm": 0.053,
             "pupil_centre_mm": 0.12,
             "ellipticity": 0.0145,
             "pupil_shift": 0.05,
