@@ -42,7 +42,8 @@ def cut_region(image: NDArray[Any], region: SearchRegion) -> tuple[NDArray[Any],
     else:
         if given.shape != (4,) or given.dtype.kind not in "iu":
             raise InputError("must be (x, y, width, height) in whole pixels, or a mask (h, w)", path="roi")
-        x, y, x1, y1 = *given[:2].tolist(), *(given[:2] + given[2:]).tolist()
+        x, y, wide, high = (int(value) for value in given)
+        x1, y1 = x + wide, y + high
         if not (0 <= x < x1 <= width and 0 <= y < y1 <= height):
             raise InputError(f"{tuple(given.tolist())} is not inside the image of {width} x {height} px", path="roi")
         inside = np.ones((y1 - y, x1 - x), dtype=bool)

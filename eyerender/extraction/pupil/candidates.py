@@ -395,7 +395,7 @@ def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noi
     crop, hidden, raw = (np.ascontiguousarray(one[::every, ::every]) for one in parts)
     about = ((cx - columns.start) / every, (cy - rows.start) / every, a / every, b / every, ellipse.angle_rad)
     darker, core, ring, between = _interior(crop, hidden, about, end)
-    spot, covered = _inner_half(raw, hidden, about)
+    spot, covered = _inner_half(crop, raw, hidden, about)
     spread = math.sqrt(max((0.7413 * between) ** 2 - noise_dn**2, 0.0))
     error = 1.2533 * noise_dn * math.sqrt(1.0 / max(core, 1) + 1.0 / max(ring, 1))
     if end < 0.6 or core < 5 or ring < 5:
@@ -443,26 +443,25 @@ def _interior(crop: Image, hidden: Bools, ellipse: tuple[float, ...], end: float
     return quantile_of(ring[:n_ring], 0.5) - quantile_of(core[:n_core], 0.5), n_core, n_ring, spread
 
 
-@compiled("f4[:,::1], b1[:,::1], UniTuple(f8, 5)")
-def _inner_half(raw: Image, hidden: Bools, ellipse: tuple[float, ...]) -> tuple[float, float]:
-    """Examine the inner half of an ellipse (cx, cy, a, b, angle), in levels from before glints were replaced.
-
-    Their surroundings, which are replaced too, hide a pupil of a few px.
+@compiled("f4[:,::1], f4[:,::1], b1[:,::1], UniTuple(f8, 5)")
+def _inner_half(crop: Image, raw: Image, hidden: Bools, ellipse: tuple[float, ...]) -> tuple[float, float]:
+    """Examine the inner half of an ellipse (cx, cy, a, b, angle).
 
     Returns:
-        How much darker than the median the darkest pixels are, but for SPECKS, and the share that glints cover.
+        How much darker than the median the darkest pixels are, but for SPECKS, and the share that glints cover. The
+        darkest are those of the `raw` image: with a glint, its surroundings are replaced, which hides a tiny pupil.
     """
     cx, cy, a, b, angle = ellipse
     cos, sin = math.cos(angle), math.sin(angle)
-    half, n, covered = np.empty(raw.size), 0, 0
+    level, half, n, covered = np.empty(raw.size), np.empty(raw.size), 0, 0
     for y in range(raw.shape[0]):
         for x in range(raw.shape[1]):
             p, q = ((x - cx) * cos + (y - cy) * sin) / a, ((y - cy) * cos - (x - cx) * sin) / b
             if p * p + q * q < 0.25:
-                half[n] = raw[y, x]
+                level[n], half[n] = crop[y, x], raw[y, x]
                 covered += hidden[y, x]
                 n += 1
-    spot = quantile_of(half[:n], 0.5) - quantile_of(half[:n], SPECKS / n) if n > SPECKS else 0.0
+    spot = quantile_of(level[:n], 0.5) - quantile_of(half[:n], SPECKS / n) if n > SPECKS else 0.0
     return spot, covered / max(n, 1)
 
 
