@@ -115,3 +115,27 @@ def test_an_even_picture_shows_no_pupil(quality, noise):
     for seed in range(6):
         image = _camera(np.full((240, 320), 120.0), noise, np.random.default_rng(seed), quality)
         assert not extract(image).pupil.ok
+
+
+def _eye(centre: tuple[float, float]) -> np.ndarray:
+    """Levels of a pupil of 28 px in an iris of 70 px (240, 320)."""
+    levels = 150.0 - 65.0 * _disc((240, 320), centre, 70.0, 4.0)
+    return levels + (30.0 - levels) * _disc((240, 320), centre, 28.0, 1.5)
+
+
+def test_a_dark_ruff_at_the_rim_and_a_mirrored_window():
+    """A crescent of the ruff, up to 4 px wide, along a third of the rim; and a window's light across pupil and iris."""
+    y, x = np.mgrid[:240, :320]
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        centre, turn = (160.0 + rng.uniform(-3, 3), 120.0 + rng.uniform(-3, 3)), rng.uniform(0, 2 * np.pi)
+        bearing = np.angle(np.exp(1j * (np.arctan2(y - centre[1], x - centre[0]) - turn)))
+        wide = 28.0 + 4.0 * np.cos(np.clip(1.5 * bearing, -np.pi / 2, np.pi / 2))
+        ruff = np.where(np.hypot(x - centre[0], y - centre[1]) < wide, np.minimum(_eye(centre), 48.0), _eye(centre))
+        left, top = centre[0] - rng.uniform(0, 25), centre[1] - rng.uniform(0, 25)
+        window = _eye(centre) + 60.0 * ((x > left) & (x < left + 34) & (y > top) & (y < top + 26))
+        for levels, far in ((ruff, 2.0), (window, 0.5)):
+            pupil = extract(_camera(cv2.GaussianBlur(levels, (0, 0), 1.2), 1.5, rng)).pupil
+            assert pupil.ok
+            assert np.hypot(*(pupil.ellipse.centre_px - centre)) < far  # half of the ruff's width
+            assert _radius(pupil) == pytest.approx(28.0, rel=0.05)
