@@ -31,7 +31,7 @@ from ..folders.imagefolder import (
     packed_index,
     shard_name,
 )
-from ..folders.packed import INDEX
+from ..folders.packed import INDEX, TAR
 from .card import data_card
 from .croissant import CROISSANT, croissant
 from .done import FILES, PACKED, checksum, compare_sums, is_sums, layout_of, read_done, run_versions, sum_of
@@ -66,8 +66,13 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     if not statistics.images:
         raise EyerenderError(f"{folder}: no sample of this spec can be made; see {FAILURES} for the reasons")
     more = table.write()
+    sums = {table.layout.table: checksum(folder / table.layout.table), **statistics.tars}
+    write_json(folder / CROISSANT, croissant(plan, sums))
+    card = data_card(plan, statistics.to_mapping())
+    write_text(folder / CARD, card)
+    statistics.bytes += sum((folder / name).stat().st_size for name in (table.layout.table, FAILURES, CROISSANT, CARD))
+    statistics.bytes += 2 * len(json.dumps(plan.to_mapping(), indent=1))  # of run.json and dataset.json
     found = statistics.to_mapping()
-    write_text(folder / CARD, data_card(plan, found))
     dataset = {
         "schema": table.layout.dataset,
         "kind": "dataset",
@@ -86,7 +91,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 class LineTable:
-    """Table of the images of a dataset: metadata.jsonl, with the lines of all shards, and its Croissant description."""
+    """Table of the images of a dataset: metadata.jsonl, with the lines of all shards."""
 
     layout = FILES
 
@@ -106,7 +111,6 @@ class LineTable:
                 f"the lines of a shard do not have the format of this version ({type(error).__name__}: {error})",
                 source=str(self._folder),
             ) from None
-        write_json(self._folder / CROISSANT, croissant(self._plan, checksum(self._folder / METADATA)))
         return {}
 
     def _lines(self) -> Iterator[str]:
@@ -252,6 +256,7 @@ class Statistics:
         self.backends: set[str] = set()
         self.rounding: set[str] = set()  # fingerprints
         self.images = self.saturated = self.rejected = self.given_up = self.samples = self.bytes = 0
+        self.tars: dict[str, str] = {}  # SHA-256 of packed shards, by name
         self.splits: Counter[str] = Counter()
         self.subjects: dict[str, set[int]] = {}
         self.pupil_px: list[float] = []
@@ -269,7 +274,10 @@ class Statistics:
         self.saturated += done["images_saturated"]
         self.rejected += len(done["rejections"])
         self.given_up += len(done["given_up"])
-        self.bytes += sum(entry["bytes"] for entry in done["files"].values())
+        # Of done.json, what grows with the images, which is the same on every machine, and about 1 kB more.
+        record = 1000 + len(json.dumps([done["files"], done.get("columns"), done.get("chosen")]))
+        self.bytes += sum(entry["bytes"] for entry in done["files"].values()) + record
+        self.tars |= {name: entry["sha256"] for name, entry in done["files"].items() if name.endswith(TAR)}
 
     def take_line(self, line: dict[str, Any]) -> None:
         """Count one image from its metadata."""

@@ -137,7 +137,7 @@ The images are PNG files of `bit_depth` bits, 16 unless the spec says otherwise.
 `gamma` is 1; otherwise count / full scale = linear^(1 / gamma). `eyerender.torch` gives the codes as stored here, and
 so does `eyerender export-dataset` for images of 8 bits (`encoding: stored`).
 {WHOLE}
-{IMAGEFOLDER}
+{WEBDATASET if spec.is_packed else IMAGEFOLDER}
 ## Conventions
 - World frame: {CONVENTIONS["world_frame"]}.
 - Pixels: {CONVENTIONS["pixels"]}.

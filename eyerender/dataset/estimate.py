@@ -24,6 +24,7 @@ from ..base.spec import Positive, Spec
 from ..base.storage.cachefolder import cache_folder
 from ..base.storage.files import read_json, write_json
 from ..folders.imagefile import picture_bytes
+from ..folders.packed import pack_lines
 from .done import cpu_family
 from .maker import Maker
 from .options import RunOptions
@@ -36,6 +37,8 @@ _WARM, _MORE = 8, 4  # samples until the kernels of both eyes of a person are re
 _SUBJECTS = 3  # that are measured after these
 ENOUGH_SAMPLES = 200  # more samples do not make a rate more representative
 _BYTES = 2**16
+_ENTRY, _MEMBER = 170, 768  # bytes of a picture's entry in done.json; of its header in a tar, and of what fills a block
+_SHARD_BYTES = {False: 1500, True: 7000}  # of done.json, and of the end of a tar in packed shards
 _Count = Annotated[float, Field(ge=0, le=1e15)]
 
 
@@ -104,7 +107,7 @@ class Speed:
             how="run",
             time=now(),
             backend=next(iter(self.backends)),
-            samples=samples,
+            samples=max(self.samples, 1),  # those of a worker's start say little
             start_seconds=self.loading_s + max(spent - begun * usual, 0.0) / len(self.firsts),
             seconds=usual,
             subject_seconds=0.0,
@@ -247,7 +250,8 @@ def measured_rate(plan: Plan, maker: Maker, *, loading_s: float = 0.0) -> Rate:
         seconds=usual,
         subject_seconds=extra,
         images=float(np.mean([one.images for one in made])),
-        bytes=float(np.mean([one.bytes for one in made])),
+        bytes=float(np.mean([one.bytes for one in made]))
+        + _SHARD_BYTES[plan.spec.is_packed] * len(plan.spec.shards) / samples,
     )
     keep_rate(plan, rate)
     return rate
@@ -259,16 +263,20 @@ class _Timed:
 
     seconds: float
     images: int
-    bytes: int
+    bytes: float
 
 
 def _timed(maker: Maker, samples: Iterable[int]) -> list[_Timed]:
     """Make samples in memory like a worker, which traces one sample while it finishes the previous one."""
-    found, began = [], time.perf_counter()
+    found, lines, began = list[_Timed](), list[dict[str, Any]](), time.perf_counter()
+    is_packed = maker.plan.spec.is_packed
     for made in maker.make_all(samples):
-        size = sum(len(picture_bytes(picture)) for image in made.images for picture in image.pictures.values())
-        # Metadata is stored in the shards and in the assembled file.
-        size += 2 * sum(len(json.dumps(image.line)) for image in made.images)
+        pictures = [picture for image in made.images for picture in image.pictures.values()]
+        size = sum(len(picture_bytes(picture)) + (_MEMBER if is_packed else _ENTRY) for picture in pictures)
+        lines += (image.line for image in made.images)
+        # Metadata of files is stored in the shards and in the assembled file.
+        size += 0 if is_packed else 2 * sum(len(json.dumps(image.line)) for image in made.images)
         began, last = time.perf_counter(), began
         found.append(_Timed(began - last, len(made.images), size))
-    return found
+    more = len(pack_lines(lines)[0]) / len(found) if is_packed and lines else 0.0
+    return [replace(one, bytes=one.bytes + more) for one in found]

@@ -80,6 +80,8 @@ class PlanOptions:
             (webdataset).
         shard_size: Replace the number of samples in a shard.
         spp: Replace the number of samples per pixel.
+        bit_depth: Replace the bits of the pictures, with the gain and the black level scaled along (default with layout
+            webdataset: 8, because loaders of such tars clip 16-bit codes at 255, which makes them white).
     """
 
     subjects: int | None = None
@@ -88,6 +90,7 @@ class PlanOptions:
     layout: Literal["files", "webdataset"] | None = None
     shard_size: int | None = None
     spp: int | None = None
+    bit_depth: Literal[8, 16] | None = None
 
     def apply(self, spec: DatasetSpec, count: int | None = None) -> DatasetSpec:
         """Return the spec with these changes; `count` is the number of samples to make, by default that of the spec.
@@ -97,17 +100,11 @@ class PlanOptions:
         Raises:
             InputError: a value cannot be parsed, or does not fit.
         """
-        from .draws import is_draw
         from .picturesize import scaled
 
         samples = count or spec.count
         if self.subjects is not None:
-            if self.subjects > samples:
-                reason = f"must be at most {samples}, the number of samples, not {self.subjects}"
-                raise InputError(reason, source="--subjects")
-            planned = max(samples, spec.planned_count)
-            own = {"subjects": self.subjects, "planned": None if planned == spec.count else planned}
-            spec = spec.replaced("--subjects", own)
+            spec = _of_subjects(spec, self.subjects, samples)
         if self.splits is not None:
             spec = spec.replaced("--splits", {"splits": _splits(self.splits)})
         if self.size is not None:
@@ -116,14 +113,33 @@ class PlanOptions:
             spec = spec.replaced("--layout", _of_layout(spec, self.layout, samples))
         if self.shard_size is not None:
             spec = spec.replaced("--shard-size", {"shard_size": self.shard_size})
+        return self._of_scene(spec)
+
+    def _of_scene(self, spec: DatasetSpec) -> DatasetSpec:
+        """Return the spec with other samples per pixel and bits."""
+        from .draws import is_draw
+        from .picturesize import with_bits
+
         if self.spp is not None:
+            image = spec.scene.get("image") or {}
             if self.spp < 1:
                 raise InputError(f"must be >= 1, not {self.spp}", source="--spp")
-            image = spec.scene.get("image") or {}
             if is_draw(image):
                 raise InputError("the spec draws the whole image", source="--spp")
             spec = spec.replaced("--spp", {"scene": {**spec.scene, "image": {**image, "spp": self.spp}}})
+        sensor = spec.scene.get("sensor") or {}
+        is_drawn = is_draw(sensor) or is_draw(sensor.get("bit_depth"))
+        bits = self.bit_depth or (8 if self.layout == "webdataset" and not is_drawn else None)
+        if bits is not None:
+            spec = spec.replaced("--bit-depth", {"scene": with_bits(spec.scene, bits)})
         return spec
+
+
+def _of_subjects(spec: DatasetSpec, subjects: int, samples: int) -> DatasetSpec:
+    if subjects > samples:
+        raise InputError(f"must be at most {samples}, the number of samples, not {subjects}", source="--subjects")
+    planned = max(samples, spec.planned_count)
+    return spec.replaced("--subjects", {"subjects": subjects, "planned": None if planned == spec.count else planned})
 
 
 def _of_layout(spec: DatasetSpec, layout: str, samples: int) -> dict[str, Any]:

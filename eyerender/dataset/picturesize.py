@@ -1,4 +1,4 @@
-"""Change the image size: scale cameras and lengths in pixels of a scene template, so that they see the same."""
+"""Change image size and bits: scale cameras, lengths in pixels and codes of a template, so that they see the same."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ _LENGTHS = {
     "openings": {"edge_px": Opening.model_fields["edge_px"].default},
     "star": {"reach_px": Star.model_fields["reach_px"].default},
 }
+_CODES = ("gain_dn_per_e", "black_level_dn", "border_dn")  # of a sensor, in codes
 _COUNTS = {"reach_px": (2, 200), "border_px": (0, 4096)}  # whole numbers, and their bounds
 _SIZES = ("low", "high", "mean", "sd", "value", "values", "components")  # keys of a draw that are in its unit
 
@@ -47,6 +48,21 @@ def scaled(scene: Mapping[str, Any], size_px: tuple[int, int]) -> dict[str, Any]
     if window is not None:
         out["image"] = {**out["image"], "window_px": list(size_px)}
     return out
+
+
+def with_bits(scene: Mapping[str, Any], bits: int) -> dict[str, Any]:
+    """Replace the bits of the pictures, and scale gain, black level and the borders' code to the new full scale.
+
+    Raises:
+        InputError: the sensor or its bit depth is drawn.
+    """
+    sensor = scene.get("sensor") or {}
+    old = sensor.get("bit_depth", Sensor.model_fields["bit_depth"].default)
+    if is_draw(sensor) or not isinstance(old, int):
+        raise InputError("the spec draws it", source="--bit-depth")
+    factor = (2**bits - 1) / (2**old - 1)
+    scaled = {key: _length(sensor[key], factor, key) for key in _CODES if sensor.get(key) is not None}
+    return {**scene, "sensor": {**sensor, "bit_depth": bits, **scaled}}
 
 
 def _cameras(node: Any) -> list[Mapping[str, Any]]:

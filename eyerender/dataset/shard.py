@@ -9,6 +9,7 @@ run ends.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -88,7 +89,8 @@ def staged(partial: PartialShard) -> Staged:
         rejected=len(done["rejections"]),
         given_up=len(done["given_up"]),
         seconds=partial.seconds,
-        bytes=sum(entry["bytes"] * (1 + name.endswith(LINES)) for name, entry in done["files"].items()),
+        bytes=sum(entry["bytes"] * (1 + name.endswith(LINES)) for name, entry in done["files"].items())
+        + len(json.dumps(done)),
     )
 
 

@@ -64,7 +64,7 @@ def test_a_dataset_of_single_eyes_says_why_gaze_has_no_estimate(tiny, capsys):
 
 
 def disk_of(folder):
-    names = ("*.png", "lines.jsonl", "metadata.jsonl")
+    names = ("*.png", "lines.jsonl", "metadata.jsonl", "done.json")
     return sum(p.stat().st_size for name in names for p in folder.rglob(name))
 
 
@@ -102,12 +102,12 @@ def test_a_dry_run_uses_the_last_rate_of_the_spec(spec, tmp_path, monkeypatch, c
     many = ("--count", str(10**9), "--seed", "7", "--workers", "1")
     text, found = dry_run(spec, capsys, *many)
     assert found["rate"]["how"] == "run"
-    assert found["rate"]["samples"] == 6
+    assert found["rate"]["samples"] == 4  # without the first shard of the worker, which holds its start
     assert found["images"] == 10**9
-    assert found["bytes"] == pytest.approx(10**9 * size / 6, rel=1e-9)
+    assert found["bytes"] == pytest.approx(10**9 * size / 6, rel=0.01)
     assert found["seconds"] == pytest.approx(found["rate"]["start_seconds"] + 10**9 * found["rate"]["seconds"])
     assert (
-        f"about {found['seconds'] / 86400:.1f} days, {found['bytes'] / 1e12:.1f} TB (rate of a run with 6 samples"
+        f"about {found['seconds'] / 86400:.1f} days, {found['bytes'] / 1e12:.1f} TB (rate of a run with 4 samples"
         in text
     )
     # Another spec, another backend, and a damaged cache: unknown.

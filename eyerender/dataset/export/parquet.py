@@ -68,7 +68,7 @@ def write(items: Items, out: Path) -> str:
                 file = _File(parquet, pa, schema, out, split, items.images_by_split[split])
                 files[split] = stack.enter_context(file)
             files[split].add(row)
-    return _head(items, types, out)
+    return _head(items, types, out, {split: file.nbytes for split, file in files.items()})
 
 
 def libraries(layout: str) -> tuple[Any, Any]:
@@ -142,6 +142,7 @@ class _File:
         self._writer: Any = None
         self._rows: list[dict[str, Any]] = []
         self._done = self._bytes = 0
+        self.nbytes = 0  # of all rows in memory, as `datasets` counts them
 
     def add(self, row: dict[str, Any]) -> None:
         """Add a row."""
@@ -158,7 +159,9 @@ class _File:
 
     def _write(self) -> None:
         if self._rows:
-            self._writer.write_table(self._pa.Table.from_pylist(self._rows, schema=self._schema))
+            table = self._pa.Table.from_pylist(self._rows, schema=self._schema)
+            self._writer.write_table(table)
+            self.nbytes += table.nbytes
         self._rows, self._bytes = [], 0
 
     def _close(self) -> None:
@@ -177,7 +180,7 @@ class _File:
             self._writer.close()
 
 
-def _head(items: Items, types: dict[str, str], out: Path) -> str:
+def _head(items: Items, types: dict[str, str], out: Path, nbytes: dict[str, int]) -> str:
     size = sum(path.stat().st_size for path in (out / "data").iterdir())
     total = len(items)
     data = {
@@ -193,8 +196,12 @@ def _head(items: Items, types: dict[str, str], out: Path) -> str:
         ],
         "dataset_info": {
             "features": [{"name": name, "dtype": kind} for name, kind in types.items()],
-            "splits": [{"name": name, "num_examples": count} for name, count in items.images_by_split.items()],
+            "splits": [
+                {"name": name, "num_bytes": nbytes[name], "num_examples": count}
+                for name, count in items.images_by_split.items()
+            ],
             "download_size": size,
+            "dataset_size": sum(nbytes.values()),
         },
     }
     return f"---\n{yaml.safe_dump(data, sort_keys=False)}---\n"
