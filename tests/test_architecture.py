@@ -245,7 +245,7 @@ BOUNDS = {
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2640,  # one door for child processes and stored files; arguments of public functions checked, for all users
     "cli": 2635,  # tables of features, targets and gaze; units, intervals and what is counted, for readers of reports
-    "dataset": 10225,  # the codes that cameras stored in every export, shards of a stated size, for trainers
+    "dataset": 10235,  # the codes that cameras stored in every export, shards of a stated size, for trainers
     "design": 3290,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
     "eye": 4135,  # spectacle lenses from prescriptions or as made; fixation, legs of rays and reflections, for the same

@@ -350,6 +350,8 @@ class Plan:
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
         eye, eye_drawn, _ = self._eye_of(tree, turn) if own is None else (own.eye, {}, False)
+        if own is None and spec.population is not None and eye:
+            tree = _with_optics(tree, self.base)
         return Sample(
             turn=turn,
             split=self.split_of(subject) if own is None or own.split is None else own.split,
@@ -412,7 +414,7 @@ class Plan:
         return choice_of(json.dumps(choice, sort_keys=True))
 
     def _eye_of(self, tree: Mapping[str, Any], turn: Turn) -> tuple[dict[str, Any], dict[str, Any], bool]:
-        if self.spec.population is not None:
+        if self.spec.population is not None and not self.eyes:
             return {}, {}, False
         variables = self.variable_template.values(turn)[0]["variables"]
         values, drawn = self.eye_template.values(turn, variables)
@@ -504,10 +506,7 @@ def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
     if is_draw(part):
         raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
     given = isinstance(part, Mapping) and "model" in part
-    if spec.population is not None:
-        if given:
-            reason = "cannot stand beside a population, which gives the eyes"
-            raise InputError(reason, source=source, path="scene.eye.model")
+    if spec.population is not None and not given:
         return []
     names = possible(part["model"]) if given else ["E2"]
     for name in names:
@@ -524,8 +523,6 @@ def _is_at(path: str, name: str) -> bool:
 def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
     """Return the parts of a spec with another eye model."""
     part = spec.scene.get("eye", {})
-    if spec.population is not None:
-        raise InputError("the spec draws people with eyes of their own; take 'population' out of it", source="--eye")
     if not isinstance(part, Mapping) or is_draw(part):
         raise InputError("the spec draws the whole eye; choose the model in the spec", source="--eye")
     load_eye(eye)
@@ -533,6 +530,24 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
     model = eye if eye in catalogue_names() else str(Path(eye).resolve())
     parameters = {name: values for name, values in spec.eye_parameters.items() if name == model}
     return {"scene": {**spec.scene, "eye": {**part, "model": model}}, "eye_parameters": parameters}
+
+
+def _with_optics(tree: Mapping[str, Any], base: Path) -> dict[str, Any]:
+    """Turn the scene of a drawn person into one of the eye model that it names.
+
+    Look, lids, the distance of the eyes and the diameter of the stop remain those of the person.
+
+    Raises:
+        InputError: the person cannot be drawn in this scene.
+    """
+    model = tree["eye"]["model"]
+    rest = {key: value for key, value in tree["eye"].items() if key != "model"}
+    scene = Scene.compiled(SceneSpec.from_mapping({**tree, "eye": rest}), base=base)
+    data = {key: value for key, value in scene.spec.to_mapping().items() if key not in ("person", "population")}
+    set_pupil = ("luminance_cd_m2", "field_deg", "accommodation_d")
+    subject = {key: value for key, value in data["subject"].items() if key not in set_pupil}
+    stop = scene.stop_diameter_mm(scene.spec.subject.eyes[0])
+    return {**data, "subject": subject, "eye": {**data.get("eye", {}), "model": model, "pupil_diameter_mm": stop}}
 
 
 @lru_cache(maxsize=64)

@@ -149,11 +149,11 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
         try:
             sample = plan.draw(index, attempt)
         except InputError as error:
-            if plan.scenes is None:
+            if plan.scenes is None and spec.population is None:
                 raise
             failed = error
             rejections.append(Rejection(index, attempt, str(error)))
-            if not plan.scenes.takes_attempt:
+            if plan.scenes is not None and not plan.scenes.takes_attempt:
                 break
             continue
         if last is not None and not _drawn_again(plan, last, sample):

@@ -5,16 +5,19 @@ from __future__ import annotations
 import pytest
 
 from eyerender.base.errors import BackendError
+from eyerender.cli.main import run
 from eyerender.dataset.maker import Maker
 from eyerender.dataset.picturesize import scaled
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.dataset.validate import validate
+from eyerender.folders.imagefolder import ImageFolder
 from eyerender.imaging.folder import render_folder
 from eyerender.scene import Scene, is_dataset, load_scene, shipped_files, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import make
+from tests.support.in_process import single_workers_in_process
 
 pytestmark = pytest.mark.render
 
@@ -98,3 +101,20 @@ def test_a_window_at_grazing_incidence_leaves_the_picture_finite():
     plan = Plan.of(DatasetSpec.from_mapping(data))
     (sample,) = Maker(plan, frames_of(plan), threads=1).make_all([200])
     assert len(sample.images) == 1
+
+
+def test_shipped_datasets_state_their_licence():
+    assert {DatasetSpec.load(path).licence for path in shipped_datasets().values()} == {"CC0-1.0"}
+
+
+@pytest.mark.render
+def test_a_recipe_of_people_is_made_with_another_eye(tmp_path, capsys):
+    argv = ["generate", "people_openeds", "--eye", "E1", "--count", "2", "--size", "50x80", "--spp", "2"]
+    with single_workers_in_process():
+        assert run([*argv, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
+    for entry in ImageFolder.load(tmp_path / "out"):
+        assert entry.records[0]["eye_model"] == "E1"
+        assert entry.labels["lid_margins_px"] is not None
+    assert "## Licence\nCC0-1.0" in (tmp_path / "out" / "README.md").read_text()
+    capsys.readouterr()
+    assert run(["validate", str(tmp_path / "out"), "--render", "1"]) == 0
