@@ -239,7 +239,7 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 88200,  # what datasets teach by mistake; files of other programs; eyes behind glasses, for users
+    "": 88210,  # what datasets teach by mistake; files of other programs; eyes behind glasses, for users
     "analytic": 1045,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 16760,  # two rigs compared, for their makers; dependences that teach something false, for data makers
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
@@ -255,7 +255,7 @@ BOUNDS = {
     "optics": 5180,
     "population": 2520,
     "region": 4110,  # heads from STL and GLB files of any tool, with all mistakes named at once
-    "rendering": 12660,  # pictures through spectacles, with their reflections, for the same
+    "rendering": 12670,  # pictures through spectacles, with their reflections, for the same
     "report": 970,
     "rig": 3900,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
     "scene": 2325,  # people, times and lens reflections in records; cameras past lenses; refusals where written

@@ -36,7 +36,10 @@ from .draws import (
 from .expressions import REFERENCE, evaluate, is_reference, names_of
 
 # Values that identify a subject, drawn once per subject unless the draw says otherwise.
-IDENTITY = ("eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "eye_parameters")
+IDENTITY = (
+    "eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "subject.spectacles",
+    "eye_parameters",
+)  # fmt: skip
 # Exceptions, which change with every frame.
 PASSING = ("region.blink",)
 # Values of the eye, which never change between frames, whatever the draw says.

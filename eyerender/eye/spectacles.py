@@ -94,11 +94,15 @@ class LensSurfaces(Spec):
         return self
 
 
-class _Solved(NamedTuple):
-    """Shape of a lens: radii of front and back (None: a plane), conic constants, thickness."""
+Bend = float | tuple[float, float] | None
+"""Radius of a surface (mm), or both along y and z; None: a plane."""
 
-    front_mm: float | tuple[float, float] | None
-    back_mm: float | tuple[float, float] | None
+
+class _Solved(NamedTuple):
+    """Shape of a lens: radii of front and back, conic constants, thickness."""
+
+    front_mm: Bend
+    back_mm: Bend
     asphericities: tuple[float, float]
     thickness_mm: float
 
@@ -261,7 +265,7 @@ class SpectacleLens(Spec):
             index = MATERIALS["CR-39"].index(NOMINAL_NM)
         behind = base / (1.0 - 1e-3 * thickness_mm * base / index)
         bend = [_radius_mm(behind - power, index) for power in (self.sphere_d, self.sphere_d + self.cylinder_d)]
-        back: float | tuple[float, float] | None = bend[0]
+        back: Bend = bend[0]
         if self.cylinder_d:
             # A biconic takes a very large radius for a plane meridian.
             back = (bend[0] or _FLAT_MM, bend[1] or _FLAT_MM)
@@ -291,9 +295,7 @@ def _radius_mm(power_d: float, index: float) -> float | None:
     return None if abs(power_d) < 1e-9 else 1000.0 * (index - 1.0) / power_d
 
 
-def _surface(
-    radius: float | tuple[float, float] | None, asphericity: float, origin: Floats, rotation: Floats
-) -> Surface:
+def _surface(radius: Bend, asphericity: float, origin: Floats, rotation: Floats) -> Surface:
     if radius is None:
         return Quadric.plane(origin, rotation)
     if isinstance(radius, float | int):
@@ -304,7 +306,7 @@ def _surface(
 def back_vertex_power_d(solved: _Solved, index: float) -> Floats:
     """Compute the back vertex powers (2,) in dioptres along the lens's y and z: F1 / (1 - t F1 / n) + F2."""
 
-    def curvature(radius: float | tuple[float, float] | None) -> Floats:
+    def curvature(radius: Bend) -> Floats:
         return np.zeros(2) if radius is None else 1.0 / np.broadcast_to(np.asarray(radius, dtype=float), 2)
 
     front = (index - 1.0) * curvature(solved.front_mm)

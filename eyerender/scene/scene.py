@@ -522,14 +522,7 @@ class Scene:
         return [self.eye(EYES[int(key[0])], tuple(key[1:].tolist())) for key in keys], which.reshape(-1)
 
     def refuse_spectacles(self, what: str) -> None:
-        """Raise an error for a scene with spectacles.
-
-        Args:
-            what: what does not follow them.
-
-        Raises:
-            InputError: somebody wears spectacles.
-        """
+        """Raise an `InputError` for a scene with spectacles, which `what` does not follow."""
         if self.spec.subject.spectacles is not None:
             raise InputError(f"{what} without spectacles so far", source=self.source, path="subject.spectacles")
 

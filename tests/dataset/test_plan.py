@@ -30,6 +30,7 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
     assert sorted(shipped_datasets()) == [
         "bench_world",
         "dataset_binocular",
+        "dataset_glasses",
         "dataset_quick",
         "dataset_region",
         *PEOPLE,

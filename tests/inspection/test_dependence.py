@@ -116,6 +116,7 @@ MORE = (
     "people_iris_camera",
     "dataset_region",
     "dataset_binocular",
+    "dataset_glasses",
 )
 
 

@@ -226,7 +226,14 @@ def _device_lens(lens: Any, kinds: tuple[Kind, Kind]) -> DeviceLens:
         for s, kind in zip((lens.front, lens.back), kinds, strict=True)
     )
     return DeviceLens(
-        front=front, back=back, centre=lens.centre, axes=lens.axes, half=lens.half, reach=lens.reach, gain=lens.gain
+        front=front,
+        back=back,
+        centre=lens.centre,
+        axes=lens.axes,
+        half=lens.half,
+        reach=lens.reach,
+        gain=lens.gain,
+        edge=lens.edge,
     )
 
 

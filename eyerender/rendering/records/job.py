@@ -247,6 +247,7 @@ def _lens_parameters(lens: WornLens) -> LensParameters:
         half=lens.half_mm,
         reach=float(np.linalg.norm(lens.centre_mm)) + _LENS_REACH_MM,
         gain=gain,
+        edge=float(n == 1.0),
     )
 
 

@@ -142,6 +142,7 @@ class LensParameters:
         half: half axes of the outline along y and z, mm.
         reach: distance from the frame's origin (mm) from which on rays are moved to the lens before they are traced.
         gain: factor on Fresnel's transmittance of both surfaces.
+        edge: weight of rays that meet the edge: 0, or 1 at index 1, where nobody sees it.
     """
 
     front: SurfaceParameters
@@ -151,6 +152,7 @@ class LensParameters:
     half: tuple[Number, Number]
     reach: Number
     gain: Number
+    edge: Number
 
 
 @dataclass(frozen=True, slots=True)

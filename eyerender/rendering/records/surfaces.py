@@ -272,6 +272,7 @@ class DeviceLens:
     half: tuple[mi.Float, mi.Float]
     reach: mi.Float
     gain: mi.Float
+    edge: mi.Float
 
     def inside(self, x: mi.Vector3f) -> mi.Bool:
         """Return whether points lie inside the outline."""
@@ -279,7 +280,9 @@ class DeviceLens:
         return y * y + z * z <= 1
 
     def pass_ray(self, o: mi.Vector3f, d: mi.Vector3f, weight: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
-        """Pass camera rays through the lens or beside it; rays that its edge stops have the weight 0.
+        """Pass camera rays through the lens or beside it; rays that its edge stops have its weight.
+
+        Bent rays start as far away as the camera, so that distances along them are those from the camera.
 
         Args:
             o: origins.
@@ -295,9 +298,9 @@ class DeviceLens:
         stopped = ~through & (enters | (met & self.inside(straight) & (dr.dot(straight - o, d) > 0)))
         share = dr.sqrt(first * second * self.gain)
         return (
-            dr.select(through, far, o),
+            dr.select(through, far - dr.norm(far - o) * behind, o),
             dr.select(through, behind, d),
-            weight * dr.select(through, share, dr.select(stopped, 0, 1)),
+            weight * dr.select(through, share, dr.select(stopped, self.edge, 1)),
         )
 
     def shade(self, x: mi.Vector3f, lamp: mi.Vector3f) -> mi.Float:

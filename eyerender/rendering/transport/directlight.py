@@ -316,7 +316,7 @@ def _through_lenses(
     active: mi.Bool,
     ahead_mm: float,
 ) -> tuple[LampConnection, mi.Vector3f]:
-    """Solve for paths through worn lenses and the eye, for the lamps that light it through them.
+    """Solve for paths through worn lenses, also beyond their outlines, and the eye, for lamps that light it so.
 
     Args:
         frame: the frame.
@@ -339,7 +339,7 @@ def _through_lenses(
     for lens in frame.turned_lenses:
         for surface in (lens.front, lens.back):
             y, w, _, good = surface.refract(y, w)
-            ok &= good & lens.inside(y)
+            ok &= good
         gain *= lens.gain
     cornea, _, _, met = chain[0].refract(y, w)
     distance = dr.norm(source - cornea)
