@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import cv2
 import numpy as np
@@ -102,7 +103,8 @@ def test_a_wrong_region_ends_with_one_line(values, reason, file, tmp_path, capsy
 def test_masks_of_another_size_and_empty_ones_are_refused(two_eyes):
     with pytest.raises(InputError, match="has the shape"):
         extract(two_eyes[0], roi=np.ones((10, 10)))
-    for wrong in ((1, 2, 3), (0.5, 0.0, 20.0, 20.0), "left", [[[1]]]):
+    wrongs: list[Any] = [(1, 2, 3), (0.5, 0.0, 20.0, 20.0), "left", [[[1]]]]
+    for wrong in wrongs:
         with pytest.raises(InputError, match="must be"):
             extract(two_eyes[0], roi=wrong)
     with pytest.raises(InputError, match="is empty"):
