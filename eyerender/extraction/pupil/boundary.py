@@ -19,7 +19,7 @@ from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges
 from .glare import Inpainted, inpaint_glints
 from .places import holding
 
-SPOT = 0.5  # share of the step by which a spot in the middle is darker where it may be a small pupil in an iris
+SPOT = 0.4  # share of the step by which a spot in the middle is darker where it may be a small pupil in an iris
 RINGING_DN = 12.0  # darker spots beside a glint than this are not made by compression
 # Unevenness at which the pixel model has half the weight, and its weight below which it is not fitted. Drawn ellipses
 # scatter by up to 0.003 of the radius, also in textured irises; nearly all recorded pupils by 0.005 to 0.016.
