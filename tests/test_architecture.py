@@ -257,7 +257,7 @@ BOUNDS = {
     "region": 4110,  # heads from STL and GLB files of any tool, with all mistakes named at once
     "rendering": 12670,  # pictures through spectacles, with their reflections, for the same
     "report": 970,
-    "rig": 3900,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
+    "rig": 3950,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
     "scene": 2325,  # people, times and lens reflections in records; cameras past lenses; refusals where written
 }
 

@@ -17,6 +17,7 @@ length tells the model: 5 for k1, k2, p1, p2, k3; 8 for these and k4, k5, k6; 6 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -28,6 +29,7 @@ from ..base.spec import Number, Spec
 from ..base.storage.files import shown
 
 FISHEYE_COUNT, RATIONAL_COUNT = 6, 8
+POLYNOMIAL = 9  # coefficients of `ray_polynomials`
 FARTHEST_RAD = float(np.radians(110.0))
 """Largest angle from the axis of a fisheye's rays; the polynomials of wider lenses are not measured beyond."""
 
@@ -208,3 +210,30 @@ def fold_radius(k: Floats, most: float = np.inf) -> tuple[float, float]:
         return np.inf, np.inf
     with np.errstate(divide="ignore"):
         return reach, abs(reach * float(n(reach**2) / m(reach**2)))
+
+
+@lru_cache(maxsize=16)  # a camera has the same in every frame
+def ray_polynomials(k: tuple[float, ...], corner: float) -> tuple[float, ...]:
+    """Fit the rays of a fisheye: sin(theta) / theta_d, cos(theta) and d theta / d theta_d over theta_d^2.
+
+    Returns:
+        The coefficients (3 x `POLYNOMIAL`,), the constant ones first, and the largest theta_d^2: that of `corner`, the
+        farthest radius of the sensor, or of the fold. Nothing if single precision would miss the functions by 1e-6.
+    """
+    t = fold_radius(np.array(k))[0] * np.sin(np.linspace(1e-6, np.pi / 2, 2000))
+    growth = sum((1.0, *k[:4])[n] * t ** (2 * n) for n in range(5))
+    inside = t * growth <= corner
+    t, radius = t[inside], (t * growth)[inside]
+    slope = sum((2 * n + 1) * (1.0, *k[:4])[n] * t ** (2 * n) for n in range(5))
+    out, s = [], radius**2
+    with np.errstate(divide="ignore"):
+        wanted = np.sin(t) / radius, np.cos(t), 1 / slope
+    for values in wanted:
+        fit = np.polynomial.Polynomial.fit(s, np.minimum(values, 1e6), POLYNOMIAL - 1).convert().coef
+        single, found = s.astype(np.float32), np.zeros(len(s), np.float32)
+        for one in fit[::-1]:
+            found = np.float32(one) + single * found
+        if not np.max(np.abs(found - values)) < 1e-6:
+            return ()
+        out += np.pad(fit, (0, POLYNOMIAL - len(fit))).tolist()
+    return (*out, float(s[-1]))

@@ -14,7 +14,14 @@ import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.rig.camera import Camera, PinholeCamera
-from eyerender.rig.distortion import distort, distorted_area, distortion_data, undistort
+from eyerender.rig.distortion import (
+    POLYNOMIAL,
+    distort,
+    distorted_area,
+    distortion_data,
+    ray_polynomials,
+    undistort,
+)
 
 K = np.array([[281.5, 0.0, 321.25], [0.0, 279.75, 238.5], [0.0, 0.0, 1.0]])
 FISHEYES = ([0.0, 0.0, 0.0, 0.0], [0.05, -0.01, 0.003, -0.001], [-0.02, 0.004, -0.001, 0.0002])
@@ -191,3 +198,28 @@ def test_a_file_of_several_cameras_asks_which(tmp_path):
     assert Camera.from_opencv(path, camera="cam1", **PLACED).build().distortion[0] == -0.2
     with pytest.raises(InputError, match=r"holds no camera 'cam2', only 'cam0, cam1'"):
         Camera.from_opencv(path, camera="cam2", **PLACED)
+
+
+@pytest.mark.parametrize("k", FISHEYES)
+@pytest.mark.parametrize("corner", [0.6, 1.3])
+def test_polynomials_of_rays_hold_in_single_precision(k, corner):
+    """Within 2e-6 of the rays of the camera: a thousandth of a pixel at a focal length of 500 px."""
+    *numbers, most = ray_polynomials((*k, 0.0, 0.0), corner)
+    radius = np.linspace(0.01, most**0.5, 500)
+    sine, cosine, spread = (
+        np.polynomial.polynomial.polyval(
+            (radius**2).astype(np.float32), np.array(numbers[n : n + POLYNOMIAL], np.float32)
+        )
+        for n in range(0, 3 * POLYNOMIAL, POLYNOMIAL)
+    )
+    lens = camera({"model": "fisheye", "k": k})
+    rays = lens.rays(np.stack([K[0, 0] * radius + K[0, 2], np.full(500, K[1, 2])], axis=1))
+    np.testing.assert_allclose(radius * sine, rays[:, 0], atol=2e-6)
+    np.testing.assert_allclose(cosine, rays[:, 2], atol=2e-6)
+    angle = np.arccos(rays[:, 2])
+    np.testing.assert_allclose(spread[1:-1], np.gradient(angle, radius)[1:-1], atol=1e-3)
+    assert abs(most**0.5 - min(corner, lens.fold[1])) < 2e-3
+
+
+def test_lenses_that_polynomials_do_not_fit_have_none():
+    assert ray_polynomials((-0.1, 0.0, 0.0, 0.0, 0.0, 0.0), 1.5) == ()  # it folds at 1.217

@@ -21,11 +21,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...rig.camera import Window
-from ...rig.distortion import distort, distorted_area, is_fisheye, is_imaged, newton_step
+from ...rig.distortion import POLYNOMIAL, distort, distorted_area, is_fisheye, is_imaged, newton_step
 from ..records.frame import DeviceFrame, sequence
 from .hostdata import BoundFrame
 
 _UNDISTORT_STEPS = 6
+_TANGENTIAL_STEPS = 3
 _SMALL_RAD = 1e-4  # below it sin(x) / x is 1 in single precision
 _UNDISTORTED = 1e-4  # largest accepted residual of Newton's method, in units of the focal length
 _CALLS = 3  # pairs of further numbers of a sample
@@ -195,8 +196,10 @@ def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3
     fx, fy = frame.camera.focal
     cx, cy = frame.camera.principal
     xd, yd = (u - cx) / fx, (v - cy) / fy
+    if frame.camera.polynomials:
+        return _through_fisheye(frame, xd, yd)
     x, y = mi.Float(xd), mi.Float(yd)
-    k = frame.camera.distortion
+    k, measured = frame.camera.distortion, frame.structure.measured_falloff
     if frame.structure.distorted:
         for _ in range(_UNDISTORT_STEPS):
             dx, dy = newton_step(x, y, xd, yd, k)
@@ -215,12 +218,37 @@ def camera_ray(frame: DeviceFrame, u: mi.Float, v: mi.Float) -> tuple[mi.Vector3
         d = frame.camera.right * x + frame.camera.down * y + frame.camera.forward
         inv = dr.rsqrt(dr.squared_norm(d))
         d, weight = d * inv, inv * inv
-    if frame.structure.distorted:
-        light = mi.Float(1) if frame.structure.measured_falloff else weight * dr.rsqrt(area)
-        weight = dr.select(imaged, light, 0)
-    elif frame.structure.measured_falloff:
+    if measured:
         weight = mi.Float(1)
-    o, way = frame.camera.centre, d
+    if frame.structure.distorted:
+        weight = dr.select(imaged, weight if measured else weight * dr.rsqrt(area), 0)
+    return _behind_lenses(frame, d, weight)
+
+
+def _behind_lenses(frame: DeviceFrame, d: mi.Vector3f, weight: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+    """Follow a ray from the camera through the lenses worn."""
+    o = frame.camera.centre
     for lens in frame.lenses:
-        o, way, weight = lens.pass_ray(o, way, weight)
-    return o, way, weight
+        o, d, weight = lens.pass_ray(o, d, weight)
+    return o, d, weight
+
+
+def _through_fisheye(frame: DeviceFrame, xd: mi.Float, yd: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
+    """Compute `camera_ray` from `ray_polynomials`, in a fraction of the time of `newton_step`."""
+    camera, (*_, p1, p2), (*numbers, most) = frame.camera, frame.camera.distortion, frame.camera.polynomials
+    x, y = xd, yd
+    for _ in range(_TANGENTIAL_STEPS):  # a contraction, since these terms are small
+        r2 = x * x + y * y
+        x, y = xd - (2 * p1 * x * y + p2 * (r2 + 2 * x * x)), yd - (p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+    area = (1 + 2 * p1 * y + 6 * p2 * x) * (1 + 6 * p1 * y + 2 * p2 * x) - dr.square(2 * p1 * x + 2 * p2 * y)
+    s, found = x * x + y * y, []
+    for first in range(0, 3 * POLYNOMIAL, POLYNOMIAL):
+        value = numbers[first + POLYNOMIAL - 1]
+        for one in numbers[first : first + POLYNOMIAL - 1][::-1]:
+            value = dr.fma(value, s, one)
+        found.append(value)
+    share, cosine, spread = found
+    d = (camera.right * x + camera.down * y) * share + camera.forward * cosine
+    measured = frame.structure.measured_falloff
+    weight = mi.Float(1) if measured else dr.sqrt(dr.maximum(cosine, 0) * share * spread / area)
+    return _behind_lenses(frame, d, dr.select((s < most) & (area > 0), weight, 0))

@@ -27,6 +27,7 @@ from ...region.limbus import upwards
 from ...region.look import Look
 from ...region.texture import film_ripples
 from ...rig.camera import PinholeCamera, Window
+from ...rig.distortion import ray_polynomials
 from ...rig.imaging import Ambient, Lens
 from ...rig.light import Lamp
 from ...rig.sensor import Sensor
@@ -172,10 +173,16 @@ def tables(eye: EyeModel) -> tuple[NDArray[np.float32] | None, ...]:
     return tuple(lattice(s, float(eye.limbus_radius_mm)).table if isinstance(s, Measured) else None for s in eye.front)
 
 
+def _corner(camera: PinholeCamera) -> float:
+    """Compute the distance of the farthest corner of the sensor from the principal point, in focal lengths."""
+    ends = np.array([[-0.5, -0.5], np.array(camera.resolution_px) - 0.5]) - camera.K[:2, 2]
+    return float(np.hypot(*(np.abs(ends).max(axis=0) / np.diag(camera.K)[:2])))
+
+
 def parameters_of(job: RenderJob) -> Parameters:
     """Compute the parameters of a frame on the host."""
     eye, look, anchor, camera = job.eye, job.look, job.anchor_mm, job.camera
-    still = _still(eye)
+    still, wide = _still(eye), camera.is_fisheye
     surfaces = (replace(still.surfaces[0], film=1 / job.film_index), *still.surfaces[1:])
     stop, sclera = eye.stop, eye.sclera
     return Parameters(
@@ -223,6 +230,7 @@ def parameters_of(job: RenderJob) -> Parameters:
             focal=(camera.K[0, 0], camera.K[1, 1]),
             principal=(camera.K[0, 2], camera.K[1, 2]),
             distortion=tuple(camera.distortion),
+            polynomials=ray_polynomials(tuple(camera.distortion.tolist()), 1.1 * _corner(camera)) if wide else (),
         ),
         pupil_albedo=look.pupil_albedo,
         globe_reach=still.globe_reach,

@@ -118,7 +118,7 @@ class CameraParameters:
     """Camera parameters for the kernels.
 
     These are the centre of projection (3,) mm, the axes right, down and forward (3,), focal lengths and principal point
-    (px), and the coefficients of the lens distortion (`rig/distortion.py`).
+    (px), the coefficients of the lens distortion, and a fisheye's `ray_polynomials` (`rig/distortion.py`).
     """
 
     centre: Vector
@@ -128,6 +128,7 @@ class CameraParameters:
     focal: tuple[Number, Number]
     principal: tuple[Number, Number]
     distortion: tuple[Number, ...]
+    polynomials: tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
