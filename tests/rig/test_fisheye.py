@@ -210,6 +210,8 @@ def test_polynomials_of_rays_hold_in_single_precision(k, corner):
         np.polynomial.polynomial.polyval(
             (radius**2).astype(np.float32), np.array(numbers[n : n + POLYNOMIAL], np.float32)
         )
+            (radius**2).astype(np.float32), np.array(numbers[n : n + POLYNOMIAL], np.float32)
+        )
         for n in range(0, 3 * POLYNOMIAL, POLYNOMIAL)
     )
     lens = camera({"model": "fisheye", "k": k})
