@@ -206,14 +206,9 @@ def test_polynomials_of_rays_hold_in_single_precision(k, corner):
     """Within 2e-6 of the rays of the camera: a thousandth of a pixel at a focal length of 500 px."""
     *numbers, most = ray_polynomials((*k, 0.0, 0.0), corner)
     radius = np.linspace(0.01, most**0.5, 500)
-    sine, cosine, spread = (
-        np.polynomial.polynomial.polyval(
-            (radius**2).astype(np.float32), np.array(numbers[n : n + POLYNOMIAL], np.float32)
-        )
-            (radius**2).astype(np.float32), np.array(numbers[n : n + POLYNOMIAL], np.float32)
-        )
-        for n in range(0, 3 * POLYNOMIAL, POLYNOMIAL)
-    )
+    single = np.array(numbers, np.float32).reshape(3, POLYNOMIAL)
+    s = (radius**2).astype(np.float32)
+    sine, cosine, spread = (np.polynomial.polynomial.polyval(s, one) for one in single)
     lens = camera({"model": "fisheye", "k": k})
     rays = lens.rays(np.stack([K[0, 0] * radius + K[0, 2], np.full(500, K[1, 2])], axis=1))
     np.testing.assert_allclose(radius * sine, rays[:, 0], atol=2e-6)
