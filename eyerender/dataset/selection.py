@@ -250,7 +250,7 @@ class Selection:
     def _mixed_at(self, start: int, stop: int) -> Ints:
         """Return the samples at the positions from `start` to `stop` of the interleaved order of all blocks."""
         block, k = np.divmod(np.arange(start, min(stop, self._blocks_end), dtype=np.int64), self.planned)
-        return self._mixed.samples_at(k) + block * self.planned
+        return np.asarray(self._mixed.samples_at(k) + block * self.planned)
 
     @property
     def _blocks_end(self) -> int:
