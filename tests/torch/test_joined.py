@@ -143,4 +143,4 @@ def test_pictures_have_the_codes_of_their_camera(tmp_path):
     assert torch.equal(FolderDataset(tmp_path / "made")[0]["image"], FolderDataset(
         tmp_path / "made", encoding="stored")[0]["image"])  # fmt: skip
     with pytest.raises(InputError, match="encoding: must be 'stored' or 'linear', not 'gamma'"):
-        FolderDataset(tmp_path / "made", encoding="gamma")
+        FolderDataset(tmp_path / "made", encoding="gamma")  # type: ignore[arg-type]

@@ -144,10 +144,9 @@ def _check_options(format: str, bits: int, encoding: Curve | None, gain: float |
         raise InputError(_ORDERED[format], source="--shuffle")
 
 
-def _encoding(items: Items, bits: int, curve: Curve | None, gain: float | None) -> Encoding:
-    if curve is None:
-        eight = "stored" if gain is None and max(items.bit_depths) <= 8 else "gamma"
-        curve = "linear" if bits == 16 else eight
+def _encoding(items: Items, bits: int, asked: Curve | None, gain: float | None) -> Encoding:
+    usual: Curve = "stored" if gain is None and max(items.bit_depths) <= 8 else "gamma"
+    curve: Curve = asked or ("linear" if bits == 16 else usual)
     if curve == "stored":
         return replace(STORED, bits=bits)
     if gain is not None:
