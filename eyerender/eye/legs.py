@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from typing import NamedTuple
@@ -176,9 +176,9 @@ class LensImage:
     surface: str
     index: int
     status: Status
-    seen_mm: Floats
-    mirror_mm: Floats
-    leaving: Floats
+    seen_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
+    mirror_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
+    leaving: Floats = field(default_factory=partial(np.full, 3, np.nan))
     share: float = np.nan
     cross_section_mm2_sr: float = np.nan
     residual_mm: float = np.nan
@@ -204,12 +204,7 @@ def lens_images(
         for k in range(len(lenses)):
             _add_images(images, lenses, k, surface, (lamps_mm, camera_mm, near_mm))
         for lamp, own in enumerate(images):
-            nothing = np.full(3, np.nan)
-            none = LensImage(
-                lamp=lamp, surface=surface, index=0, status=Status.NO_MIRROR_POINT,
-                seen_mm=nothing, mirror_mm=nothing, leaving=nothing,
-            )  # fmt: skip
-            out += own or [none]
+            out += own or [LensImage(lamp=lamp, surface=surface, index=0, status=Status.NO_MIRROR_POINT)]
     return sorted(out, key=lambda one: one.lamp)
 
 

@@ -165,6 +165,18 @@ def test_a_lens_reflection_has_the_energy_of_the_mirror_formula():
     assert len(images) == 2
 
 
+def test_defocused_reflections_leave_no_dark_rings():
+    """They are a thousand times as bright as the picture, in which ripples of a part in a thousand would show."""
+    for focus in (40.0, 58.0, 75.0):
+        image, clear = (
+            render(scene({"sphere_d": -2.0} | coat, lens={"focus_mm": focus}).frames()[0]).irradiance
+            for coat in ({}, {"reflectance": 0.0})
+        )
+        lit = clear > 0.2 * np.median(clear)
+        assert image.max() > 1000 * np.median(clear)
+        assert (image[lit] > 0.7 * clear[lit]).all()  # two passes of 92 % each
+
+
 def test_reflections_of_lenses_saturate_where_ray_optics_puts_them():
     worn = scene({"sphere_d": -2.0}, sensor={"exposure_ms": 5.0})
     image, places = render(worn.frames()[0]), trace(worn).lens_glints

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...base.arrays import Floats
+from ...base.arrays import Floats, frozen
 from ...eye.legs import LensImage, lens_images
 from ...eye.worn import WornLens
 from ...optics.transforms import normalize
 from ...rig.light import Lamp
 from .cutdiscs import POINT, quadrature
-from .tracing import Emitters, GlintScene, Image, LightPaths
+from .tracing import Emitters, GlintScene, Image, LampSpots, LightPaths
 
 _NODES = quadrature(2, 10)
 
@@ -37,6 +37,14 @@ def lens_reflections(
         rows = {one.lamp: one for one in near if one.surface == found.surface}
         out += still.pictured(emitters, _paths([rows[k] for k in range(len(emitters.points))], camera))
     return out
+
+
+def defocused(spots: LampSpots, diameter_px: float) -> LampSpots:
+    """Spread spots over discs, point by point: the kernel of a disc has ripples, which such bright spots would show."""
+    radial = min(int(np.ceil(1.5 + diameter_px)), 8)
+    nodes = quadrature(radial, 4 * radial + 2)
+    xy = spots.xy_px[:, None] + 0.5 * diameter_px * nodes.point
+    return LampSpots(frozen(xy.reshape(-1, 2)), frozen(np.outer(spots.energy, nodes.weight).ravel()))
 
 
 def _paths(images: Sequence[LensImage], camera_mm: Floats) -> LightPaths:

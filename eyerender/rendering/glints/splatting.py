@@ -17,7 +17,7 @@ from ..scene.background import Background
 from ..scene.blur import Blur
 from ..scene.region import RegionScene, blockers
 from .cutdiscs import POINT, quadrature
-from .lensglints import lens_reflections
+from .lensglints import defocused, lens_reflections
 from .purkinje import purkinje_images
 from .tracing import Glint, GlintScene, GlintTable, Image, LampImages, LampSpots, glint_table
 
@@ -131,7 +131,7 @@ class MirrorImages:
             shines += [
                 Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
             ]
-        shines += [Shine(image.spots, share, blur.subject_px) for image in self.in_lenses]
+        shines += [Shine(defocused(image.spots, blur.subject_px), share, 0.0) for image in self.in_lenses]
         others = tuple((order, glint_table(found[:count])) for order, found in further.items())
         return Mirrored(glint_table(glints[:count]), others, reasons), shines
 

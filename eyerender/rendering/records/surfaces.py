@@ -282,12 +282,8 @@ class DeviceLens:
     def pass_ray(self, o: mi.Vector3f, d: mi.Vector3f, weight: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float]:
         """Pass camera rays through the lens or beside it; rays that its edge stops have its weight.
 
-        Bent rays start as far away as the camera, so that distances along them are those from the camera.
-
-        Args:
-            o: origins.
-            d: unit directions.
-            weight: square roots of weights.
+        Origins o, unit directions d, and square roots of weights. Bent rays start as far away as the camera, so that
+        distances along them are those from the camera.
         """
         start = o + dr.maximum(-dr.dot(o, d) - self.reach, 0) * d
         near, way, first, hit = self.front.refract(start, d)

@@ -318,13 +318,8 @@ def _through_lenses(
 ) -> tuple[LampConnection, mi.Vector3f]:
     """Solve for paths through worn lenses, also beyond their outlines, and the eye, for lamps that light it so.
 
-    Args:
-        frame: the frame.
-        lamp: the lamp.
-        ends: points of the lamp, the target, and the surfaces of the eye in front of it.
-        beside: paths past the lenses, for the other lamps; None if there are none.
-        active: active lanes.
-        ahead_mm: as for `connect`.
+    `ends` are points of the lamp, the target, and the surfaces of the eye in front of it; `beside` paths past the
+    lenses for the other lamps, None if there are none. `ahead_mm` is as for `connect`.
 
     Returns:
         The paths, with their entries into the cornea, and the points in whose direction light arrives there.
