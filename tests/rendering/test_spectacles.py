@@ -198,13 +198,20 @@ def test_the_edge_of_a_lens_is_dark_and_beside_it_the_eye_is_bare():
 
 
 def test_the_command_renders_and_validates(tmp_path):
+    """Both eyes with lenses of their own, in two positions of the head, one lens on the rig."""
     file = tmp_path / "worn.yaml"
-    settings = {"image": {"spp": 8}, "region": {"seed": 2}}
-    lens = [
-        {"sphere_d": -3.0, "axis_deg": 10.0, "cylinder_d": -1.0},
-        {"sphere_d": 0.0, "vertex_mm": 20.0, "mount": "rig"},
-    ]
-    file.write_text(scene(lens, **settings).spec.to_yaml())
+    toric = {"sphere_d": -3.0, "axis_deg": 10.0, "cylinder_d": -1.0}
+    insert = {"sphere_d": 0.0, "vertex_mm": 20.0, "mount": "rig"}
+    subject = {
+        "eyes": ["right", "left"],
+        "head_positions_mm": [[0, 0, 0], [3, -2, 1]],
+        "spectacles": {"right": [toric, insert], "left": {"sphere_d": 2.0, "decentration_mm": [1.0, 0.0]}},
+    }
+    camera = {"position_mm": [500, 0, -150], "look_at_mm": [0, 0, 0], "focal_length_px": 2500,
+              "resolution_px": [640, 480]}  # fmt: skip
+    rig = {"cameras": [camera], "lights": [{"position_mm": [500, 100, -150], "intensity_mw_sr": 100.0}]}
+    settings = {"image": {"spp": 4, "window_px": [320, 240]}, "region": {"seed": 2}, "subject": subject, "rig": rig}
+    file.write_text(scene(**settings).spec.to_yaml())
     for command in (["render", str(file), "-o", str(tmp_path / "out")], ["validate", str(tmp_path / "out")]):
         with pytest.raises(SystemExit) as end:
             main(command)
