@@ -10,6 +10,7 @@ from ...base.errors import InputError
 LIMITS = {
     "people": (1, 10**6), "sample": (0, 1000), "images": (0, 1000), "workers": (1, 1024), "seed": (0, 2**63 - 1),
     "slippage_mm": (0, 20), "relief_mm": (0, 20), "azimuth_deg": (1, 60), "elevation_deg": (1, 60),
+    "luminance": (1e-3, 1e5),
 }  # fmt: skip
 
 
@@ -27,6 +28,7 @@ class RigSize:
         relief_mm: Additional standard deviation along x, for the eye relief of a headset (3 is a good choice).
         azimuth_deg: Half range of the directions of gaze, horizontally.
         elevation_deg: Half range of the directions of gaze, vertically.
+        luminance: Luminance (cd/m2) of what people see, which sets their pupils.
         backend: The render backend of the images.
     """
 
@@ -39,6 +41,7 @@ class RigSize:
     relief_mm: float = 0.0
     azimuth_deg: float = 20.0
     elevation_deg: float = 15.0
+    luminance: float = 20.0
     backend: BackendChoice = "auto"
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ from ...design.crowd import (
 )
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, place_of
-from ...design.safety import NOTE, eye_exposure
+from ...design.safety import BOX_MM, NOTE, eye_exposure
 from ...design.tolerances import UNITS, Tolerances, axes_of, unit_errors
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import staged
@@ -150,6 +150,7 @@ def survey_of(scene: Scene, population: Population, size: RigSize, unknowns: Unk
         elevation_deg=size.elevation_deg,
         slippage_mm=size.slippage_mm,
         relief_mm=size.relief_mm,
+        luminance_cd_m2=size.luminance,
         unknowns=(Unknowns.population() if unknowns is None else unknowns).to_mapping(),
     )
 
@@ -248,6 +249,10 @@ def summary(
         "refused": found.refused.tolist(),
         "directions": GRID * GRID,
         "seed": survey.seed,
+        "eye_box": {
+            "slippage_mm": survey.slippage_mm, "relief_mm": survey.relief_mm, "safety_mm": list(BOX_MM),
+            "luminance_cd_m2": survey.luminance_cd_m2,
+        },
         "unknowns": dict(survey.unknowns),
         "noise": {
             "outline_px": noise.outline_px.tolist(),
@@ -329,7 +334,9 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
     lead = [
         _answer(data),
         f"{data['people']} people look in {GRID * GRID} directions in front of the rig of '{scene.name}'. "
-        "Everything but errors on images follows from ray optics.",
+        f"Eyes stand at the scene's place, moved by half the difference in the distance of the pupils and, at random, "
+        f"by {survey.slippage_mm:g} mm per axis and {survey.relief_mm:g} mm of eye relief (standard deviations); pupils "
+        f"are those at {survey.luminance_cd_m2:g} cd/m². Everything but errors on images follows from ray optics.",
         "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
         "alone. What an estimator assumes wrongly about the eye comes on top. U50E95 and U95E95 are the median and the "
         "95th-percentile person's 95th-percentile error over the directions that the rig covers.",
