@@ -335,8 +335,8 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
         _answer(data),
         f"{data['people']} people look in {GRID * GRID} directions in front of the rig of '{scene.name}'. "
         f"Eyes stand at the scene's place, moved by half the difference in the distance of the pupils and, at random, "
-        f"by {survey.slippage_mm:g} mm per axis and {survey.relief_mm:g} mm of eye relief (standard deviations); pupils "
-        f"are those at {survey.luminance_cd_m2:g} cd/m². Everything but errors on images follows from ray optics.",
+        f"by {survey.slippage_mm:g} mm per axis and {survey.relief_mm:g} mm of eye relief (standard deviations); "
+        f"pupils are those at {survey.luminance_cd_m2:g} cd/m². Everything but errors on images is ray optics.",
         "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
         "alone. What an estimator assumes wrongly about the eye comes on top. U50E95 and U95E95 are the median and the "
         "95th-percentile person's 95th-percentile error over the directions that the rig covers.",
