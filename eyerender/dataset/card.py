@@ -111,6 +111,10 @@ def data_card(plan: Plan, statistics: dict[str, Any]) -> str:
             " Each subject was drawn into a split at random, so the sizes of the splits are only close to their shares."
         )
     licence = "" if spec.licence is None else f"## Licence\n{spec.licence}\n\n"
+    eight = spec.scene.get("sensor", {}).get("bit_depth") == 8
+    reading = "Images of 8 bits are read as they are.\n" if eight else WHOLE
+    if not eight:
+        reading += "\n" + (WEBDATASET if spec.is_packed else IMAGEFOLDER)
     size = statistics["pupil_semi_axis_px"]
     pupils = "" if size is None else f" The long semi-axis of the pupil is {size[0]:.1f} to {size[2]:.1f} px."
     return f"""# {spec.name}
@@ -136,8 +140,7 @@ made; {statistics["attempts_rejected"]} attempts were drawn again (`failures.jso
 The images are PNG files of `bit_depth` bits, 16 unless the spec says otherwise. They hold linear sensor counts where
 `gamma` is 1; otherwise count / full scale = linear^(1 / gamma). `eyerender.torch` gives the codes as stored here, and
 so does `eyerender export-dataset` for images of 8 bits (`encoding: stored`).
-{WHOLE}
-{WEBDATASET if spec.is_packed else IMAGEFOLDER}
+{reading}
 ## Conventions
 - World frame: {CONVENTIONS["world_frame"]}.
 - Pixels: {CONVENTIONS["pixels"]}.

@@ -271,9 +271,12 @@ def fit_eye(
         FitWarning: the fit may be wrong, for one of the reasons in `EyeFit.doubts`.
 
     Raises:
-        InputError: there is nothing to fit, an eye has no position, a feature lies a million pixels away, or the
-            features lead to an eye that is physically impossible or 5 standard deviations from a prior.
+        InputError: the eyes wear spectacles, there is nothing to fit, an eye has no position, a feature lies a million
+            pixels away, or the features lead to an eye that is physically impossible or 5 standard deviations from a
+            prior.
     """
+    if observations.lens_glints is not None and observations.lens_glints.ok.any():
+        raise InputError("the eyes are behind spectacles, which fits of eyes do not follow so far")
     pupils, glints = observations.pupil.centre_px, observations.glints.xy_px
     far = (np.abs(pupils) > _FARTHEST_PX).any(axis=-1) | (np.abs(glints) > _FARTHEST_PX).any(axis=(-2, -1))
     if far.any():

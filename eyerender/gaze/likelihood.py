@@ -8,6 +8,7 @@ holds. What makes a fit doubtful (`EyeFit.doubts`) is a `FitWarning`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Literal, Self
@@ -16,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats, frozen
-from ..base.errors import InputError
+from ..base.errors import FitWarning, InputError
 from ..base.spec import Spec
 from ..rig.rig import RigLike
 from ..scene.observation import EYES, Observations
@@ -117,6 +118,8 @@ class MaximumLikelihood(BuiltIn):
 
         assert isinstance(unknowns, Unknowns)
         built = rig.build()
+        if observations.lens_glints is not None and observations.lens_glints.ok.any():
+            warnings.warn("the eyes are behind spectacles, which the model does not have", FitWarning, stacklevel=4)
         noise = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=built)
         out = {}
         for eye in np.unique(observations.index.eye):

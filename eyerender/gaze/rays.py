@@ -121,11 +121,12 @@ def chosen_lights(observations: Observations, rig: RigGeometry, lights: Sequence
     if len(set(wanted)) != len(wanted) or any(k < 0 for k in wanted):
         raise InputError(f"lights {list(wanted)} are not distinct lights")
     each = " for each eye" if any(light.eyes is not None for light in rig.lights) else ""
+    if lights is not None and len(wanted) < least:
+        raise InputError(f"this estimator needs {least} lights, and {len(wanted)} is named")
     if len(wanted) < least:
         raise InputError(f"this estimator needs {least} lights, but the rig has {fewest}{each}")
     if any(k >= fewest for k in wanted):
-        named = ", ".join(map(str, wanted))
-        raise InputError(f"this estimator needs {len(wanted)} lights ({named}), but the rig has {fewest}{each}")
+        raise InputError(f"there is no light {max(wanted)}: the rig has {fewest}{each}, counted from 0")
     out = np.empty((len(observations), len(wanted)), dtype=np.int64)
     for eye, numbers in of_eye.items():
         out[observations.index.eye == eye] = [numbers[k] for k in wanted]

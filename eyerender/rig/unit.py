@@ -53,7 +53,8 @@ class UnitCalibration(Spec):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not is_rotation(self.R):
-            raise ValueError("R must be a rotation matrix")
+            mirror = np.linalg.det(self.R) < 0
+            raise ValueError("R must be a rotation matrix" + (" (its determinant is -1: a mirror)" if mirror else ""))
         return self
 
     def read(self, base: Path | None = None) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

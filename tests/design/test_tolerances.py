@@ -146,7 +146,7 @@ def test_the_command(tmp_path, capsys):
     assert found["units"]["units"] == 200
     assert "What costs how much?" in (tmp_path / "out" / "report.html").read_text()
     for bad, reason in [
-        ("- {part: led, number: 8, quantity: position_mm, sd: 1, when: after}", "0.number: the rig has no such led"),
+        ("- {part: led, number: 8, quantity: position_mm, sd: 1, when: after}", "0.number: the rig has no led 8"),
         ("- {part: led, quantity: rotation_deg, sd: 1, when: after}", "a led has position_mm, power_percent"),
         ("- {part: mirror, quantity: position_mm, sd: 1, when: after}", "the rig has no such mirror"),
         ("- {part: led, quantity: position_mm, sd: -1, when: after}", "tolerances.0.sd"),

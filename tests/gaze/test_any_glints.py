@@ -83,7 +83,7 @@ def test_the_command_takes_the_lights(tmp_path, capsys):
     assert run(["gaze", "predict", str(tmp_path / "f.json"), "-c", str(tmp_path / "c.json")]) == 0
     capsys.readouterr()
     for name, lights, reason in [
-        ("hennessey", "1", "this estimator needs 2 lights"),
+        ("hennessey", "1", "this estimator needs 2 lights, and 1 is named"),
         ("hennessey", "1,99", "the rig has 8"),
         ("hennessey", "1,-2", "lights"),
         ("hennessey", "one", "'one' is not a list of whole numbers"),

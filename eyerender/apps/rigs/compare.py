@@ -82,6 +82,8 @@ def compare_rigs(
     """
     if len(scenes) < 2:
         raise InputError("needs two rigs", path="scenes")
+    for scene in scenes:
+        scene.refuse_spectacles("rigs are compared")
     people = _evaluated(scenes, population, size, progress)
     subjects = people[0].figures.subject
     if len(subjects) < 2:

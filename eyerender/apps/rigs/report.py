@@ -46,6 +46,7 @@ from ...report.page import Card, Figure, Page, Section, Table, degrees_text, wri
 from ...report.style import heat_map
 from ...rig.rig import RigGeometry
 from ...scene import Scene
+from ...scene.observation import EYES
 from ...scene.people import Population
 from ...scene.spec import SceneSpec, Targets
 from ...scene.subject import Subject
@@ -101,8 +102,9 @@ def run_rig(
     scene.refuse_spectacles("rigs are reported on")
     whole, scene = scene, scene.of_first_eye()
     survey = survey_of(scene, population, size, unknowns)
-    if tolerances is not None:
-        list(axes_of(Scene.of(SceneSpec.from_mapping(survey.scene)), tolerances))  # refuses parts that do not exist
+    own = None if tolerances is None else of_this_eye(whole, tolerances)
+    if own is not None:
+        list(axes_of(Scene.of(SceneSpec.from_mapping(survey.scene)), own))  # refuses parts that do not exist
     noise = sensor_noise(scene)
     with staged(output, overwrite=overwrite) as folder:
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
@@ -116,12 +118,36 @@ def run_rig(
         data = summary(scene, survey, found, biases, noise, whole.rig)
         data["estimators_on_images"] = _errors_of(pictured)
         data["slippage"] = _slippage_of(*slipped)
-        data |= tolerated(survey, tolerances, scene.rig, min(UNIT_PEOPLE, size.people))
+        data |= tolerated(survey, own, scene.rig, min(UNIT_PEOPLE, size.people))
+        if tolerances is not None:
+            for row, one in zip(data["tolerances"], tolerances.tolerances, strict=True):
+                row["number"] = one.number
         write_json(folder / SUMMARY, data)
         _write_people(folder / PEOPLE, found)
         _write_gaze(folder / GAZE, survey, found)
         write_page(folder / REPORT, page_of(scene, survey, found, data))
     return data
+
+
+def of_this_eye(scene: Scene, tolerances: Tolerances) -> Tolerances:
+    """Count the parts of tolerances, whose numbers are those of the whole rig, among the parts that the first eye has.
+
+    Raises:
+        InputError: a part does not exist, or serves the other eye alone.
+    """
+    side, rig = scene.spec.subject.eyes[0], scene.rig
+    cameras = [k for k, camera in enumerate(rig.cameras) if camera.sees(side)]
+    lights = list(rig.lights_of(EYES.index(side)))
+    out = []
+    for k, one in enumerate(tolerances.tolerances):
+        count, kept = (len(rig.lights), lights) if one.part == "led" else (len(rig.cameras), cameras)
+        if one.number != "all" and one.number not in kept:
+            other = f"{one.part} {one.number} serves the other eye, and the report is about the {side} one"
+            reason = f"the rig has no {one.part} {one.number}" if one.number >= count else other
+            raise InputError(reason, path=f"tolerances.{k}.number")
+        number = one.number if one.number == "all" else kept.index(one.number)
+        out.append(one.model_copy(update={"number": number}))
+    return tolerances.model_copy(update={"tolerances": tuple(out)})
 
 
 def tolerated(survey: RigPopulation, tolerances: Tolerances | None, rig: RigGeometry, people: int) -> dict[str, Any]:
@@ -255,7 +281,7 @@ def summary(
         },
         "unknowns": dict(survey.unknowns),
         "noise": {
-            "outline_px": noise.outline_px.tolist(),
+            "outline_px": [finite_or_none(v) for v in noise.outline_px],
             "glint_px": [[finite_or_none(v) for v in row] for row in noise.glint_px],
         },
         "bound_deg": {"note": NOISE_ONLY, **gaze_of(found.bound_deg, seen)},

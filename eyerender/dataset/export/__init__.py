@@ -120,7 +120,7 @@ def export(
             "image": None if format in _PICTURELESS else items.encoding.to_mapping(items.gammas),
         }
         layout = sys.modules[FORMATS[format].__module__].__doc__ or ""
-        write_text(stage / CARD, head + export_card(items.name, done, layout), sync=False)
+        write_text(stage / CARD, head + export_card(items.name, done, layout, items.licence), sync=False)
         write_json(stage / EXPORT, done, sync=False)
     return {**done, "path": str(out)}
 

@@ -26,9 +26,10 @@ _GAZE = {
 }
 
 
-def export_card(name: str, done: dict[str, Any], layout: str) -> str:
+def export_card(name: str, done: dict[str, Any], layout: str, licence: str | None = None) -> str:
     """Return the text of README.md; `layout` describes the files."""
     splits = "\n".join(f"| {split} | {count} |" for split, count in done["images_by_split"].items())
+    terms = "" if licence is None else f"\n## Licence\n{licence}\n"
     values = "" if done["image"] is None else _values(done, done["image"])
     return f"""# {name}: {done["format"]}
 
@@ -42,7 +43,7 @@ README.md of the dataset explains how they were made and what the labels mean.
 ## Files
 {layout.strip()}
 {_GAZE.get(done["format"], "")}
-{values}"""
+{values}{terms}"""
 
 
 def _values(done: dict[str, Any], image: dict[str, Any]) -> str:

@@ -185,6 +185,7 @@ def _head(items: Items, types: dict[str, str], out: Path, nbytes: dict[str, int]
     total = len(items)
     data = {
         "pretty_name": items.name,
+        **({} if items.licence is None else {"license": items.licence.lower()}),
         "task_categories": ["image-segmentation", "keypoint-detection"],
         "tags": ["eye-tracking", "gaze-estimation", "near-infrared", "synthetic"],
         "size_categories": [next((name for end, name in _SIZES if total < end), "100M<n<1B")],
