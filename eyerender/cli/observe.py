@@ -73,7 +73,8 @@ def extract(
     scene: str | None = None,
     camera: int | None = None,
     gamma: float | None = None,
-    method: Literal["fast", "refined"] = "refined",
+    method: Literal["fast", "refined", "centroid"] = "refined",
+    reflections: Literal["filled", "excluded"] | None = None,
     eyes: int = 1,
     arrangement: Literal["side-by-side", "stacked"] | None = None,
     order: Literal["right-left", "left-right"] | None = None,
@@ -97,7 +98,9 @@ def extract(
         scene: A scene with the rig; glints are assigned to its lights and listed in their order.
         camera: Number of the scene's camera that took the images (default: 0).
         gamma: Encoding gamma of the pixel values (default: 1, linear; 8-bit videos are mostly encoded with 2.2).
-        method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit.
+        method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit; centroid: area (pi a b) and
+            centre of mass of the thresholded pupil, as many laboratory trackers report.
+        reflections: With --method centroid: whether reflections that the pupil encloses belong to it (default: filled).
         eyes: 2 for images of both eyes. The eye on the image's left is then called the right eye.
         arrangement: With --eyes 2: each image holds the pictures of two cameras, beside or above each other. The left
             or upper one shows the subject's right eye.
@@ -122,11 +125,12 @@ def extract(
     _check_extract(images, gamma, eyes)
     heed = Heed(strict)
     loaded = None if scene is None else heed.scene(scene)
-    both = {"arrangement": arrangement, "order": order}
-    for name, value in both.items():
-        if value is not None and eyes != 2:
-            raise InputError("belongs to --eyes 2", source=f"--{name}")
-    settings = _settings(radius_px, min_confidence, method=method, polarity=polarity, **both)
+    special = {"arrangement": arrangement, "order": order, "reflections": reflections}
+    for name, value in special.items():
+        needed = "--method centroid" if name == "reflections" else "--eyes 2"
+        if value is not None and needed not in (f"--method {method}", f"--eyes {eyes}"):
+            raise InputError(f"belongs to {needed}", source=f"--{name}")
+    settings = _settings(radius_px, min_confidence, method=method, polarity=polarity, **special)
     observer = ImageObserver(
         gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera, rois=_rois(roi, eyes)
     )

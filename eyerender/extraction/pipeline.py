@@ -31,6 +31,7 @@ from .pupil.glare import NO_PATCH, levels_beside
 from .pupil.refinement import PixelFit, refine
 from .pupil.scoring import ScoredCandidate, pupil_of
 from .pupil.search import find_pupil
+from .pupil.threshold import threshold_pupil
 from .region import SearchRegion, cut_region, placed
 from .result import Extraction, PupilResult
 from .settings import ExtractionSettings, Shape
@@ -106,6 +107,8 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     model = found.model
     refined = settings.method == "refined"
     pupil = pupil_of(scored, None, settings)
+    if pupil.ok and settings.method == "centroid":
+        pupil = _thresholded(pupil, found, settings.reflections == "filled")
     if not refined and not pupil.ok:
         return _nothing(pupil, noise, size)
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, settings)
@@ -131,6 +134,14 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     measured = measure_patches(prepared, model.ellipse, search_reach(model.ellipse, settings), spots, fit)
     accepted, rejected = classify_spots(measured, spots.patches_px, eye, settings)
     return Extraction(pupil=pupil, glints=accepted, rejected=rejected, noise=noise, shape=size)
+
+
+def _thresholded(pupil: PupilResult, found: PupilCandidate, filled: bool) -> PupilResult:
+    """Replace the ellipse by that of the thresholded region, which has no covariance."""
+    region = threshold_pupil(found, filled)
+    if region is None:
+        return PupilResult.missing("fit", "no pixel of the pupil is beyond the threshold")
+    return replace(pupil, ellipse=region, covariance=None)
 
 
 def _blended(edges: PupilResult, pixels: PupilResult, share: float) -> PupilResult:

@@ -23,8 +23,13 @@ class ExtractionSettings(Spec):
     'fast'
     """
 
-    method: Literal["fast", "refined"] = Field(
-        default="refined", description="fast: edges and an algebraic fit; refined: also a maximum-likelihood fit"
+    method: Literal["fast", "refined", "centroid"] = Field(
+        default="refined",
+        description="fast: edges and an algebraic fit; refined: also a maximum-likelihood fit; centroid: area and "
+        "centre of mass of the thresholded pupil",
+    )
+    reflections: Literal["filled", "excluded"] = Field(
+        default="filled", description="centroid: whether reflections that the pupil encloses belong to it"
     )
     polarity: Literal["auto", "dark", "bright"] = Field(
         default="auto", description="whether the pupil is darker or brighter than the iris; auto: the image decides"

@@ -36,6 +36,11 @@ def own_refined(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, An
     return _own(REFINED, image, request)
 
 
+def own_centroid(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
+    """Threshold the pupil that this package's extractor finds: its area and centre of mass."""
+    return _own(ExtractionSettings(method="centroid"), image, request)
+
+
 def opencv_contour(image: NDArray[Any], request: Mapping[str, Any]) -> dict[str, Any]:
     """Extract with the contour baseline."""
     from ...extraction.baseline import contour_pupil
