@@ -37,7 +37,7 @@ def bench_extractors(
 
     Args:
         folder: A folder of labelled images: written by quickstart, render or generate, your own with labels.csv or
-            masks, or in the layout of OpenEDS, TEyeD, COCO, LPW or ExCuSe.
+            masks, or in the layout of OpenEDS, TEyeD, COCO, LPW or ExCuSe. With --film: a video, or a folder.
         extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
             plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
             Repeat the option for several extractors (default: all installed ones).
@@ -51,12 +51,25 @@ def bench_extractors(
             say(f"{entry['images']} images state no gamma; {entry['gamma']:g} (linear) is assumed (--gamma)")
     if data["centres_only"]:
         say(f"{data['centres_only']} images have labels of the pupil's centre only; there, right is within 5 px of it")
-    emit(
-        data, f"{_table(data, read_json(output / TIMES, limit=2**30, follow=False))}\n\nreport: {output / REPORT}", json
-    )
+    if options.film:
+        text = _film_table(data)
+    else:
+        times = read_json(output / TIMES, limit=2**30, follow=False)
+        text = f"{_table(data, times)}\n\nreport: {output / REPORT}"
+    emit(data, text, json)
     for problem in data["problems"]:
         say(f"error: {problem}")
     return 1 if data["problems"] else 0
+
+
+def _film_table(data: dict[str, Any]) -> str:
+    """Format one line per extractor."""
+    lines = [f"{'jitter':<18} {'found':>13} {'centre px':>10} {'radius px':>10} {'common: centre':>14} {'radius':>10}"]
+    for e in data["extractors"]:
+        s, found = e["summary"], f"{e['summary']['found']} of {data['images']}"
+        own, common = ([_f(s[part][name], 4) for name in ("centre_px", "radius_px")] for part in ("jitter", "common"))
+        lines.append(f"{e['name']:<18} {found:>13} {own[0]:>10} {own[1]:>10} {common[0]:>14} {common[1]:>10}")
+    return "\n".join(lines + [f"{e['name']}: not run: {e['reason']}" for e in data["not_run"]])
 
 
 def _table(data: dict[str, Any], times: dict[str, Any]) -> str:

@@ -41,7 +41,7 @@ _SIGNS = {
     RUN: "eyerender/run/",
     "study.json": "eyerender/study/",
     "sweep.json": "eyerender/sweep/",
-    "results.json": "eyerender/bench-extractors/",
+    "results.json": "eyerender/bench-",
 }
 _SIGN_BYTES = 2**30
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp", ".exr", ".hdr")

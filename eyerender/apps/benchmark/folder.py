@@ -50,12 +50,12 @@ def load_labelled(
     if is_ideal(path):
         images = ideal_images(path)
     elif is_own(path):
-        images = _with_hints(path, own_images(path, pupil_class), None)
+        images = hinted(path, own_images(path, pupil_class), None)
     elif not (path / DATASET).exists() and (read := reader_of(path)):
-        images = _with_hints(path, read(path), stated_gamma(path))
+        images = hinted(path, read(path), stated_gamma(path))
     else:
         images = rendered_images(path, eye_error_mm)
-    return [_described(_with_gamma(image, gamma)) for image in images]
+    return [_described(with_gamma(image, gamma)) for image in images]
 
 
 def with_edge(image: BenchImage) -> BenchImage:
@@ -85,7 +85,7 @@ def _measured_edge(image: BenchImage) -> Edge | None:
     return edge_of(image.grey(), image.bit_depth, image.pupil, image.glints_px, {}, shows)
 
 
-def _with_hints(folder: Path, images: Iterable[BenchImage], gamma: float | None) -> list[BenchImage]:
+def hinted(folder: Path, images: Iterable[BenchImage], gamma: float | None) -> list[BenchImage]:
     """Add the hints stated by the folder to its images; `gamma` is that of its layout, if it states one."""
     told = FolderHints.load(folder)
     gamma = told.gamma or gamma
@@ -96,7 +96,7 @@ def _with_hints(folder: Path, images: Iterable[BenchImage], gamma: float | None)
     return out
 
 
-def _with_gamma(image: BenchImage, gamma: float | None) -> BenchImage:
+def with_gamma(image: BenchImage, gamma: float | None) -> BenchImage:
     """Replace an assumed gamma by a given one, which must not contradict a stated one."""
     stated = float(image.hints["gamma"])
     if gamma is None or (gamma == stated and image.gamma_from != "assumed"):

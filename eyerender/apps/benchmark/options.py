@@ -28,6 +28,8 @@ class BenchOptions:
         gamma: Encoding gamma of images whose folder states none (default: 1, linear).
         eye_error_mm: Standard deviation, per axis and in mm, of the error of the eye position given to extractors.
         pupil_class: Value of the pupil in masks of several classes.
+        film: The folder holds a film, or the frames of one in the order of their names, without labels: measure how
+            much the answers jitter from frame to frame.
         quick: Use a tenth of the images, with hard conditions in the same proportion.
         fresh: Ignore the answers that an interrupted run left in the output folder.
         against: The results.json of an earlier benchmark to compare with.
@@ -42,6 +44,7 @@ class BenchOptions:
     gamma: float | None = None
     eye_error_mm: Annotated[float, Parameter(name="--eye-error")] = 5.0
     pupil_class: int | None = None
+    film: bool = False
     quick: bool = False
     fresh: bool = False
     against: Path | None = None
@@ -54,6 +57,8 @@ class BenchOptions:
         for name in ("timeout_s", "start_timeout_s"):
             if not 0 < getattr(self, name) <= LONGEST_S:
                 raise InputError(f"must be above 0 and at most {LONGEST_S:g} seconds", path=name)
+        if self.film and (self.quick or self.require or self.against):
+            raise InputError("has no labels, which --quick, --require and --against need", source="--film")
         if not 0 <= self.eye_error_mm <= 1000:
             raise InputError("must be 0 to 1000 mm", source="--eye-error")
         if self.pupil_class is not None and not 1 <= self.pupil_class <= 65535:

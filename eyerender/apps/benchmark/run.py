@@ -20,6 +20,7 @@ from .asking import ExtractorResults, ask_extractors
 from .checks import RESULTS_SCHEMA, Requirement, compare_with, problems_of, read_results
 from .conditions import CONDITIONS, balanced
 from .failurekinds import KINDS, kind_of
+from .film import film_results, film_row, load_film
 from .folder import load_labelled, with_edge
 from .labelled import BenchImage
 from .options import BenchOptions
@@ -59,7 +60,7 @@ def bench_extractors(
         changes: fields of `BenchOptions` by name, instead of those of `options`.
 
     Returns:
-        The content of results.json (schema eyerender/bench-extractors/3).
+        The content of results.json (schema eyerender/bench-extractors/3, or eyerender/bench-film/1 for a film).
 
     Raises:
         InputError: the folder cannot be used, two extractors share a name, there is none, or a check cannot be made.
@@ -70,12 +71,8 @@ def bench_extractors(
     old = None if options.against is None else read_results(options.against)
     is_bench = options.overwrite or _is_bench(Path(output))
     refuse_non_empty(output, is_bench)
-    images = load_labelled(folder, options.gamma, eye_error_mm=options.eye_error_mm, pupil_class=options.pupil_class)
-    if options.quick:
-        chosen_rows = balanced([i.conditions for i in images], [i.subject or i.name for i in images])
-        images = [images[k] for k in chosen_rows]
+    images = load_film(Path(folder), options.gamma) if options.film else _labelled(folder, options)
     code = [code_digest(extractor, options.start_timeout_s) for extractor in chosen]
-    images = [with_edge(image) for image in images]
     keys = [image_key(image) for image in images]
     done, total = 0, len(chosen) * len(images)
 
@@ -87,20 +84,33 @@ def bench_extractors(
     notify(progress, 0, total, "answers")
     with staged(output, overwrite=is_bench) as place:
         answers = Answers(Path(output) / ANSWERS, task_of(chosen, code, keys), fresh=options.fresh)
-        runs = [_classified(run, images) for run in ask_extractors(chosen, images, options, answers=answers, step=step)]
-        data = _results(Path(folder), runs, images, keys)
+        runs = ask_extractors(chosen, images, options, answers=answers, step=step)
+        if not options.film:
+            runs = [_classified(run, images) for run in runs]
+        scored = film_results(runs) if options.film else _scored(runs, images, keys)
+        data = scored | _about(Path(folder), images)
         data["not_run"] = [{"name": name, "reason": reason} for name, reason in sorted(absent.items())]
         data["required"] = [
             bar.check(entry) for bar in required for entry in data["extractors"] if bar.name in ("", entry["name"])
         ]
         data["against"] = [] if old is None else compare_with(old, data, str(options.against))
         data["problems"] = problems_of(data, gated=bool(required or old))
-        rows = [row_of(run, score) for run in runs for score in run.scores]
-        write_bench_report(place / REPORT, data, rows, [one for run in runs for one in _thumbnails(run, images)])
+        rows = [(film_row if options.film else row_of)(run, score) for run in runs for score in run.scores]
+        if not options.film:
+            write_bench_report(place / REPORT, data, rows, [one for run in runs for one in _thumbnails(run, images)])
         write_text(place / TABLE, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
         write_json(place / TIMES, times_of(runs))
         write_json(place / RESULTS, data)
     return data
+
+
+def _labelled(folder: str | Path, options: BenchOptions) -> list[BenchImage]:
+    """Load the images of a labelled folder, or a tenth of them, with the pupils' edges."""
+    images = load_labelled(folder, options.gamma, eye_error_mm=options.eye_error_mm, pupil_class=options.pupil_class)
+    if options.quick:
+        chosen_rows = balanced([i.conditions for i in images], [i.subject or i.name for i in images])
+        images = [images[k] for k in chosen_rows]
+    return [with_edge(image) for image in images]
 
 
 def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[ExtractorCommand], dict[str, str]]:
@@ -119,19 +129,23 @@ def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[E
     return chosen, absent
 
 
-def _results(
-    folder: Path, runs: Sequence[ExtractorResults], images: Sequence[BenchImage], keys: Sequence[str]
-) -> dict[str, Any]:
-    """Return the content of results.json without its checks."""
+def _about(folder: Path, images: Sequence[BenchImage]) -> dict[str, Any]:
+    """Return what results.json holds of films too."""
     return {
-        "schema": RESULTS_SCHEMA,
         "folder": folder.absolute().name or str(folder),
         "images": len(images),
-        "with_pupil": sum(image.shows_pupil for image in images),
         "centres_only": sum(image.centre_px is not None for image in images),
         "gamma": gammas_of(images),
-        "image_digests": {image.name: digest_of(image, key) for image, key in zip(images, keys, strict=True)},
         "versions": versions(),
+    }
+
+
+def _scored(runs: Sequence[ExtractorResults], images: Sequence[BenchImage], keys: Sequence[str]) -> dict[str, Any]:
+    """Return what results.json holds of labelled images, without its checks."""
+    return {
+        "schema": RESULTS_SCHEMA,
+        "with_pupil": sum(image.shows_pupil for image in images),
+        "image_digests": {image.name: digest_of(image, key) for image, key in zip(images, keys, strict=True)},
         "edge": _edge_summary(images),
         "factors": {name: {"what": what, "unit": unit} for name, (what, unit) in FACTORS.items()},
         "failure_kinds": dict(KINDS),
