@@ -35,8 +35,6 @@ class PixelFit:
         ellipse: its ellipse, rounder where nothing is seen.
         covariance: (5, 5) of (cx, cy, a, b, angle).
         reduced_chi2: reduced chi^2 relative to the image's noise.
-        residual_dn: root mean square residual.
-        pixels: number of pixels used.
         sectors: (SECTORS,) which sectors of the outline were used.
     """
 
@@ -44,8 +42,6 @@ class PixelFit:
     ellipse: Ellipse
     covariance: Floats
     reduced_chi2: float
-    residual_dn: float
-    pixels: int
     sectors: Bools
 
 
@@ -190,7 +186,5 @@ def _report(
         ellipse=ellipse,
         covariance=to_axes(covariance, ellipse),
         reduced_chi2=variance / noise_dn**2,
-        residual_dn=math.sqrt(variance),
-        pixels=count,
         sectors=seen,
     )

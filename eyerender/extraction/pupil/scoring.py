@@ -57,7 +57,6 @@ def features(ellipse: Ellipse, goodness: Goodness) -> dict[str, float]:
         "unevenness": max(g.unevenness, -0.5),
         "spread": g.spread,
         "ln chi2": math.log(min(max(g.reduced_chi2, 0.3), 100.0)),
-        "uneven / b": 0.0,  # of fits that let the boundary deviate, to which the weights were fitted
         "ln leverage": math.log(g.leverage),
         "open": g.open,
         "beyond": min(g.beyond, 2.0),
