@@ -49,14 +49,10 @@ def bench_extractors(
     for entry in data["gamma"]:
         if entry["from"] == "assumed":
             say(f"{entry['images']} images state no gamma; {entry['gamma']:g} (linear) is assumed (--gamma)")
-    if data["centres_only"]:
+    if data.get("centres_only"):
         say(f"{data['centres_only']} images have labels of the pupil's centre only; there, right is within 5 px of it")
-    if options.film:
-        text = _film_table(data)
-    else:
-        times = read_json(output / TIMES, limit=2**30, follow=False)
-        text = f"{_table(data, times)}\n\nreport: {output / REPORT}"
-    emit(data, text, json)
+    times = read_json(output / TIMES, limit=2**30, follow=False)
+    emit(data, _film_table(data) if options.film else f"{_table(data, times)}\n\nreport: {output / REPORT}", json)
     for problem in data["problems"]:
         say(f"error: {problem}")
     return 1 if data["problems"] else 0

@@ -6,13 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import Bools, Floats, frozen
 from ..base.jit import ensure_compiled
-from ..optics.ellipse import signed_distance
 from .glints.classification import EyeContext, classify_spots
 from .glints.deblending import give_edges, split_blends
 from .glints.detection import Spots, detect_spots, search_reach, widest
@@ -21,7 +19,6 @@ from .glints.fitting import fit_spots
 from .glints.gaussian_model import Limits
 from .glints.patches import measure_patches
 from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
-from .glints.windows import window_radius
 from .preprocessing import DN, ImagePart, Prepared, prepare
 from .pupil.boundary import PupilCandidate
 from .pupil.consensus import far_off
@@ -39,7 +36,6 @@ from .statistics import median
 
 # Distance of a tenth of the edge points from a refined boundary that contradicts it: in their own scatter, and in px.
 APART, APART_PX = 4.0, 0.5
-SAME_LIGHT = 0.5  # noise standard deviations; a smaller change of the spots' light does not move the boundary
 
 
 def extract(
@@ -115,7 +111,7 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
     spots, fit = _fit_spots(prepared, found, spots)
     share = found.regularity
     if refined and share > 0.0:
-        pixels, fit = _refined(prepared, found, spots, fit)
+        pixels = _refined(prepared, found, spots, fit)
         if pixels is not None:
             model = pixels.model if share > 0.5 else model
             pupil = _blended(pupil, pupil_of(scored, pixels, settings), share)
@@ -168,26 +164,6 @@ def _iris_level(prepared: Prepared, found: PupilCandidate, model: EdgeModel) -> 
     return median(levels[found.sectors])
 
 
-def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit) -> tuple[PixelFit | None, SpotFit]:
-    """Fit the pixel model to the image without the spots.
-
-    Returns:
-        The fit, None if it contradicts the edges, and the spots.
-    """
-    part = part_about(found.image.linear, found.boundary.ellipse)
-    cleaned = _without_spots(prepared, part, found, spots, fit)
-    first = _boundary_fit(found, cleaned)
-    on_boundary = None if first is None else _on_boundary(spots, fit, first.model)
-    if first is None or on_boundary is None:
-        return first, fit
-    # A spot and the boundary below it were each fitted with a rough estimate of the other.
-    fit = _fitted_again(prepared, found, spots, fit, on_boundary, first.model)
-    again = _without_spots(prepared, part, found, spots, fit)
-    if cv2.norm(again[0].linear, cleaned[0].linear, cv2.NORM_INF) < SAME_LIGHT * prepared.noise_dn:
-        return first, fit
-    return _boundary_fit(found, again, first) or first, fit
-
-
 def _without_spots(
     prepared: Prepared, part: ImagePart, found: PupilCandidate, spots: Spots, fit: SpotFit
 ) -> tuple[ImagePart, Bools]:
@@ -200,37 +176,14 @@ def _without_spots(
     return dark, bright | affected_pixels(prepared, part, spots, ~known)
 
 
-def _boundary_fit(
-    found: PupilCandidate, cleaned: tuple[ImagePart, Bools], before: PixelFit | None = None
-) -> PixelFit | None:
+def _refined(prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit) -> PixelFit | None:
+    """Fit the pixel model to the image without the spots; None if it contradicts the edges."""
+    part, masked = _without_spots(prepared, part_about(found.image.linear, found.boundary.ellipse), found, spots, fit)
     try:
-        scatter = found.boundary.residual_px
-        fit = refine(cleaned[0], found.model, found.sectors, cleaned[1], found.image.noise_dn, scatter, before)
+        pixels = refine(part, found.model, found.sectors, masked, found.image.noise_dn, found.boundary.residual_px)
     except np.linalg.LinAlgError:  # the pixels do not determine the parameters
         return None
-    return fit if isinstance(fit, PixelFit) and _agrees(fit, found) else None
-
-
-def _on_boundary(spots: Spots, fit: SpotFit, model: EdgeModel) -> Bools | None:
-    """Return which spots (n,) have windows that reach the boundary; None if none does."""
-    apart = np.abs(signed_distance(model.ellipse, spots.xy_px))
-    on_boundary = fit.converged & (apart < window_radius(spots.width_px) + 3.0 * model.sigma_px)
-    return np.asarray(on_boundary) if on_boundary.any() else None
-
-
-def _fitted_again(
-    prepared: Prepared, found: PupilCandidate, spots: Spots, fit: SpotFit, on_boundary: Bools, model: EdgeModel
-) -> SpotFit:
-    """Refit the spots on the boundary with the refined boundary, and use these fits if they are no worse."""
-    part = part_about(prepared.linear, found.boundary.ellipse)
-    part, _ = subtract_spots(part, prepared.noise_dn, fit, fit.converged & ~on_boundary, model.ellipse)
-    corner = np.array(part.corner)
-    about = replace(model, ellipse=model.ellipse.shifted(-corner))
-    starts = (spots.xy_px[on_boundary] - corner, spots.width_px[on_boundary], spots.height_dn[on_boundary])
-    again = fit_spots(part.linear, _background(found.image, about), *starts, _limits(prepared, model)).fit
-    again = replace(again, xy_px=again.xy_px + corner)
-    good = again.converged & (again.residual_dn < 1.05 * fit.residual_dn[on_boundary])
-    return fit.replaced(np.flatnonzero(on_boundary)[good], again.taken(np.flatnonzero(good)))
+    return pixels if isinstance(pixels, PixelFit) and _agrees(pixels, found) else None
 
 
 def _agrees(fit: PixelFit, found: PupilCandidate) -> bool:

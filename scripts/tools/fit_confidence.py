@@ -122,7 +122,7 @@ def pixel_fit(prepared: Prepared, found: PupilCandidate) -> PixelFit | None:
     """Fit the pixel model to a boundary; None where it contradicts the edges."""
     model = found.model
     spots = detect_spots(prepared, model.ellipse, abs(model.step_dn), model.sigma_px, ExtractionSettings())
-    return pipeline._refined(prepared, found, *pipeline._fit_spots(prepared, found, spots))[0]
+    return pipeline._refined(prepared, found, *pipeline._fit_spots(prepared, found, spots))
 
 
 def _away(ellipse: Ellipse, covariance: Array, truth: Ellipse | None) -> float:

@@ -87,8 +87,9 @@ def bench_extractors(
         runs = ask_extractors(chosen, images, options, answers=answers, step=step)
         if not options.film:
             runs = [_classified(run, images) for run in runs]
-        scored = film_results(runs) if options.film else _scored(runs, images, keys)
-        data = scored | _about(Path(folder), images)
+        data = film_results(runs) if options.film else _scored(runs, images, keys)
+        data |= {"folder": Path(folder).absolute().name or str(folder), "images": len(images)}
+        data |= {"gamma": gammas_of(images), "versions": versions()}
         data["not_run"] = [{"name": name, "reason": reason} for name, reason in sorted(absent.items())]
         data["required"] = [
             bar.check(entry) for bar in required for entry in data["extractors"] if bar.name in ("", entry["name"])
@@ -129,22 +130,12 @@ def _chosen(extractors: Sequence[str | ExtractorCommand] | None) -> tuple[list[E
     return chosen, absent
 
 
-def _about(folder: Path, images: Sequence[BenchImage]) -> dict[str, Any]:
-    """Return what results.json holds of films too."""
-    return {
-        "folder": folder.absolute().name or str(folder),
-        "images": len(images),
-        "centres_only": sum(image.centre_px is not None for image in images),
-        "gamma": gammas_of(images),
-        "versions": versions(),
-    }
-
-
 def _scored(runs: Sequence[ExtractorResults], images: Sequence[BenchImage], keys: Sequence[str]) -> dict[str, Any]:
     """Return what results.json holds of labelled images, without its checks."""
     return {
         "schema": RESULTS_SCHEMA,
         "with_pupil": sum(image.shows_pupil for image in images),
+        "centres_only": sum(image.centre_px is not None for image in images),
         "image_digests": {image.name: digest_of(image, key) for image, key in zip(images, keys, strict=True)},
         "edge": _edge_summary(images),
         "factors": {name: {"what": what, "unit": unit} for name, (what, unit) in FACTORS.items()},

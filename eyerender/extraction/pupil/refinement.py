@@ -52,7 +52,6 @@ def refine(
     masked: Bools,
     noise_dn: float,
     scatter_px: float,
-    before: PixelFit | None = None,
 ) -> PixelFit | str:
     """Fit the pixel model, or return the reason for failure.
 
@@ -66,15 +65,13 @@ def refine(
         masked: (h, w) which pixels glints affect or the sensor clipped.
         noise_dn: standard deviation of a pixel's noise.
         scatter_px: rms distance of the edge points from their ellipse.
-        before: an earlier fit of the same boundary, as a start.
     """
-    model = replace(start, outer=_padded(start.outer, ORDERS[0])) if before is None else before.model
+    model = replace(start, outer=_padded(start.outer, ORDERS[0]))
     band = _near_boundary(part, model, masked)
     use = np.ones(band.x.size, dtype=bool)
     # A lid must not decide the order of the outer level.
-    seen = clear_of_lids(sectors, start) if before is None else before.sectors
-    turns = TURNS if before is None else 1
-    for turn in range(turns):
+    seen = clear_of_lids(sectors, start)
+    for turn in range(TURNS):
         pixels = BoundaryPixels.of(band, use, seen)
         if pixels.x.size < 60:
             return "too few pixels on the boundary are free of glints and lids"
@@ -86,8 +83,8 @@ def refine(
         new_seen = clear_of_lids(explained, model)
         if new_seen.sum() < 0.15 * SECTORS:
             return "too little of the boundary fits the pixel model"
-        order = _best_order(pixels, model) if turn == 0 and before is None else ORDERS[0]
-        if ((new_use == use).all() and (new_seen == seen).all() and order == ORDERS[0]) or turn + 1 == turns:
+        order = _best_order(pixels, model) if turn == 0 else ORDERS[0]
+        if ((new_use == use).all() and (new_seen == seen).all() and order == ORDERS[0]) or turn + 1 == TURNS:
             break
         model = replace(model, outer=_padded(model.outer, order)) if turn == 0 else model
         use, seen = new_use, new_seen
