@@ -9,6 +9,7 @@ Both datasets yield each image as a mapping with the requested parts:
 | `image`, `noiseless` | float32 (1, h, w): codes of the camera as a share of the full scale, 0 to 1 |
 | `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the view |
 | `highlight_mask` | int64 (h, w): 1 where wet and oily surfaces mirror a lamp |
+| `lens_reflection_mask` | int64 (h, w): 1 where a spectacle lens mirrors more light than comes from behind it |
 | `instance_mask` | int64 (h, w): as `mask`, with 5 skin, 6 upper lid, 7 lower lid, 8 lashes, 9 brow, 10 caruncle |
 | `depth`, `normals`, `iris_coordinates` | float32 (1, h, w), (3, h, w), (2, h, w): arrays of geometry, nan: none |
 | `glints` | float32 (lights, 3): x, y in px of the image, and 1 visible or 0 hidden; nan where there is none |
@@ -62,6 +63,7 @@ _PICTURES = {
     "mask": "masks",
     "amodal_mask": "amodal_masks",
     "highlight_mask": "highlights",
+    "lens_reflection_mask": "lens_reflections",
     "instance_mask": "instances",
     "depth": "depth",
     "normals": "normals",

@@ -32,6 +32,8 @@ _MORE = {
     "amodal_masks": "\n- `amodal_mask_file_name`: the same without anything in front of the eye.",
     "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without sensor noise.",
     "highlights": "\n- `highlight_mask_file_name`: 1 where wet and oily surfaces mirror a lamp; these are no glints.",
+    "lens_reflections": "\n- `lens_reflection_mask_file_name`: 1 where a spectacle lens mirrors more light than comes "
+    "from behind it.",
     "depth": "\n- `depth_file_name` (.npz, array `data`): mm along the camera's axis to the first surface; NaN: none.",
     "normals": "\n- `normals_file_name` (.npz): its unit normals in the camera's frame (x right, y down, z forward).",
     "iris_coordinates": "\n- `iris_coordinates_file_name` (.npz): the place in the plane of the iris that the pixel "

@@ -176,6 +176,7 @@ _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
     "amodal_masks": attrgetter("rendered.labels.amodal"),
     "noiseless": noiseless,
     "highlights": lambda image: np.asarray(image.rendered.highlights, np.uint8),
+    "lens_reflections": attrgetter("lens_reflections"),
     "depth": attrgetter("rendered.geometry.depth"),
     "normals": attrgetter("rendered.geometry.normals"),
     "iris_coordinates": attrgetter("rendered.geometry.iris_coordinates"),

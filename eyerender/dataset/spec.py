@@ -49,6 +49,11 @@ class LabelsSpec(Spec):
         "are no glints",
     )
 
+    lens_reflections: bool = Field(
+        default=False,
+        description="also write masks of where spectacle lenses mirror more light than comes from behind them",
+    )
+
     geometry: tuple[GeometryKind, ...] | None = Field(
         default=None,
         description="also write what each pixel's centre shows: `depth` (mm along the camera's axis), `normals` (in "
@@ -64,11 +69,11 @@ class LabelsSpec(Spec):
     @property
     def pictures(self) -> tuple[str, ...]:
         """Kinds of images that every sample has; each kind has its own folder."""
-        more = {"amodal_masks": self.amodal_masks, "noiseless": self.noiseless, "highlights": self.highlights}
+        more = ("amodal_masks", "noiseless", "highlights", "lens_reflections")
         return (
             "images",
             "masks",
-            *(kind for kind, wanted in more.items() if wanted),
+            *(kind for kind in more if getattr(self, kind)),
             *sorted(set(self.geometry or ())),
         )
 

@@ -195,7 +195,8 @@ class Course:
                 reflected = np.full(whole.shape, lens.reflectances[crossing.surface is lens.back])
             whole = whole * (reflected if crossing.reflects else 1.0 - reflected)
             if k > 0 and self.owners[k - 1] == owner and not crossing.reflects:
-                whole = whole * lens.transmission / (1.0 if self.path[k - 1].reflects else 1.0 - known * reflected)
+                with np.errstate(invalid="ignore"):  # both are 1 on rays that do not exist
+                    whole = whole * lens.transmission / (1.0 if self.path[k - 1].reflects else 1.0 - known * reflected)
             known = reflected
         return whole
 

@@ -63,6 +63,7 @@ KINDS = {
     "amodal_masks": "amodal_mask_file_name",
     "noiseless": "noiseless_file_name",
     "highlights": "highlight_mask_file_name",
+    "lens_reflections": "lens_reflection_mask_file_name",
     "depth": "depth_file_name",
     "normals": "normals_file_name",
     "iris_coordinates": "iris_coordinates_file_name",
@@ -71,7 +72,7 @@ KINDS = {
 # Keys of a line that name arrays of real numbers, with the number of channels of each (0: none).
 ARRAY_KEYS = {"depth_file_name": 0, "normals_file_name": 3, "iris_coordinates_file_name": 2}
 # Keys of a line that name files of the folder.
-FILE_KEYS = (*KINDS.values(), "lens_reflection_mask_file_name", "annotated_mask_file_name")
+FILE_KEYS = (*KINDS.values(), "annotated_mask_file_name")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,6 +196,10 @@ class ImageEntry:
     def highlight_mask(self) -> Bytes | None:
         """Read the mask of lamp highlights on wet and oily surfaces (1, else 0); like `mask`."""
         return self.pixels("highlight_mask_file_name")
+
+    def lens_reflection_mask(self) -> Bytes | None:
+        """Read where lenses mirror more light than comes from behind them (1, else 0); like `mask`."""
+        return self.pixels("lens_reflection_mask_file_name")
 
     def instance_mask(self) -> Bytes | None:
         """Read what each pixel shows, with lids, lashes, brow and skin apart (docs/formats.md); like `mask`."""

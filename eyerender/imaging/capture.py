@@ -71,6 +71,12 @@ class EyeImage:
         return f"{index.frame[0]:06d}_{EYES[index.eye[0]]}"
 
     @property
+    def lens_reflections(self) -> Bytes:
+        """Where lenses mirror more light than comes from behind them, (height, width): 1, else 0."""
+        found = self.rendered.lens_reflections
+        return np.zeros(self.parts.shape, np.uint8) if found is None else np.asarray(found, np.uint8)
+
+    @property
     def apex_mm(self) -> Floats:
         """Apex of the unrotated eye in the world, (3,) mm."""
         return np.asarray(self.frame.index.eye_position_mm[0] + self.frame.index.head_mm[0])

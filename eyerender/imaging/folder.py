@@ -58,14 +58,18 @@ def render_folder(
     lines: list[dict[str, Any]] = []
     saturated = 0
     spec = scene.spec
+    worn = spec.subject.spectacles is not None
     with staged(path, overwrite=overwrite) as folder, Writer() as writer:
-        (folder / "images").mkdir()
-        (folder / "masks").mkdir()
+        for kind in ("images", "masks", *(["lens_reflections"] if worn else [])):
+            (folder / kind).mkdir()
         for image in render_windows(frames, backend=backend, threads=threads, progress=progress):
             line = image_line(scene, records[image.row], image.window, image_labels(image, truth))
             line |= {"file_name": f"images/{image.name}.png", "mask_file_name": f"masks/{image.name}.png"}
             writer.put(folder / line["file_name"], image.counts)
             writer.put(folder / line["mask_file_name"], image.parts)
+            if worn:
+                line["lens_reflection_mask_file_name"] = f"lens_reflections/{image.name}.png"
+                writer.put(folder / line["lens_reflection_mask_file_name"], image.lens_reflections)
             if exr:
                 from ..rendering.scene.exr import write_exr
 

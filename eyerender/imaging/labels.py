@@ -304,8 +304,13 @@ def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any
     table = image.rendered.glints
     spot = table.xy_px[k]
     lit = bool(np.isfinite(spot).all())
+    visible = lit and bool(table.visible[k]) and bool(in_window(image.window, spot))
+    if visible:
+        column, row = np.rint(np.clip(spot - image.window[:2], 0, np.array(image.window[2:]) - 1)).astype(int)
+        if image.lens_reflections[row, column]:
+            visible, hidden_by = False, "occluded by lens reflection"
     return {
-        "visible": lit and bool(table.visible[k]) and bool(in_window(image.window, spot)),
+        "visible": visible,
         "hidden_by": hidden_by,
         "visible_share": float(table.share[k]),
         "spot_xy_px": spot.tolist() if lit else None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tarfile
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from eyerender.analytic.observer import trace
 from eyerender.cli.main import main
 from eyerender.eye.legs import refracted_legs
 from eyerender.eye.worn import Course
+from eyerender.folders.imagefolder import ImageFolder
 from eyerender.imaging.capture import check_windows, render_job
 from eyerender.imaging.images import render
+from eyerender.imaging.labels import image_labels
 from eyerender.optics.interface import fresnel
 from eyerender.optics.shooting import ray_tube
 from eyerender.optics.solve import refracting_path
@@ -25,7 +28,7 @@ from eyerender.scene.spec import SceneSpec
 EVEN = {"iris_contrast": 0.0, "limbal_ring": 0.0, "iris": {"relief": 0.0}, "pupil_albedo": 0.0}
 
 
-def scene(spectacles=None, **more):
+def scene(spectacles=None, validate=True, **more):
     spec = {
         "format": 2,
         "name": "glasses",
@@ -39,6 +42,8 @@ def scene(spectacles=None, **more):
         "poses": [{"azimuth_deg": 6.0, "elevation_deg": 3.0}],
         "image": {"spp": 64},
     } | more  # fmt: skip
+    if not validate:
+        return spec
     return Scene.of(SceneSpec.from_mapping(spec))
 
 
@@ -197,6 +202,53 @@ def test_the_edge_of_a_lens_is_dark_and_beside_it_the_eye_is_bare():
     assert dark.mean() > 0.8  # its edge crosses most columns
 
 
+def test_the_mask_of_reflections_is_where_they_outshine_what_lies_behind():
+    """Against a lens that mirrors nothing and passes as much: (1 - R)^2 / (1 - R^2)."""
+    given, share = {"sphere_d": -2.0, "pantoscopic_deg": 12.47, "wrap_deg": -5.62}, 0.04
+    worn = scene(given | {"reflectance": share})
+    image = render(worn.frames()[0])
+    clear = scene(given | {"reflectance": 0.0, "transmission": (1 - share) ** 2 / (1 - share**2)})
+    behind = render(clear.frames()[0])
+    ratio = image.irradiance / behind.irradiance - 1.0
+    mask = image.lens_reflections
+    assert 20 < mask.sum() < 5000
+    # Rounding decides only where both are equal.
+    assert (mask[ratio > 1.01] == 1).all()
+    assert (mask[ratio < 0.99] == 0).all()
+    assert not behind.lens_reflections.any()
+    # The tilt puts the reflection of the front over the corneal glint, which is a hundred times as faint.
+    truth = trace(worn)
+    assert np.linalg.norm(truth.glints.xy_px[0, 0] - truth.lens_glints.xy_px[0, 0]) < 1.0
+    for picture, reason in ((image, "occluded by lens reflection"), (behind, "visible")):
+        glint = image_labels(picture, trace(picture.scene))["glints"][0]
+        assert (glint["visible"], glint["hidden_by"]) == (reason == "visible", reason)
+        assert glint["visible_share"] == 1.0
+
+
+def test_packed_datasets_and_exports_hold_the_masks_of_reflections(tmp_path):
+    file, out = tmp_path / "worn.yaml", tmp_path / "out"
+    tree = scene({"sphere_d": {"draw": "uniform", "low": -3, "high": -1}}, image={"spp": 2}, validate=False)
+    labels = {"lens_reflections": True}
+    spec = {"format": 3, "kind": "dataset", "name": "worn", "count": 2, "labels": labels, "scene": tree}
+    file.write_text(json.dumps(spec))
+    for command in (
+        ["generate", file, out, "--layout", "webdataset"],
+        ["validate", out],
+        ["export-dataset", out, tmp_path / "tars", "--format", "webdataset"],
+    ):
+        with pytest.raises(SystemExit) as end:
+            main([str(part) for part in command])
+        assert not end.value.code
+    for entry in ImageFolder.load(out):
+        mask = entry.lens_reflection_mask()
+        assert set(np.unique(mask)) == {0, 1}
+    names = []
+    for path in (tmp_path / "tars").glob("*.tar"):
+        with tarfile.open(path) as tar:
+            names += tar.getnames()
+    assert sum(name.endswith(".lens_reflections.png") for name in names) == 2
+
+
 def test_the_command_renders_and_validates(tmp_path):
     """Both eyes with lenses of their own, in two positions of the head, one lens on the rig."""
     file = tmp_path / "worn.yaml"
@@ -219,6 +271,8 @@ def test_the_command_renders_and_validates(tmp_path):
     line = json.loads((tmp_path / "out" / "metadata.jsonl").read_text().splitlines()[0])
     assert [one["sphere_d"] for one in json.loads(line["parameters"]["spectacles"])] == [-3.0, 0.0]
     assert line["records"][0]["lens_glints"]
+    assert line["lens_reflection_mask_file_name"] == line["file_name"].replace("images", "lens_reflections")
+    assert [entry.lens_reflection_mask().any() for entry in ImageFolder.load(tmp_path / "out")] == [True] * 4
 
 
 def test_meshed_eyes_with_spectacles_are_refused():

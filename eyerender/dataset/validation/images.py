@@ -67,14 +67,14 @@ def check_images(entry: ImageEntry, limbus_px: Floats | None, tally: Tally) -> I
     if float(image.max()) > full:
         yield f"has values above {full:g}"
     tally.take(image, full)
-    quiet, mask, whole, bright = (
-        None if picture is None else picture[0]
-        for picture in (entry.picture(f"{k}_file_name") for k in ("noiseless", "mask", "amodal_mask", "highlight_mask"))
-    )
+    names = ("noiseless", "mask", "amodal_mask", "highlight_mask", "lens_reflection_mask")
+    pictures = (entry.picture(f"{name}_file_name") for name in names)
+    quiet, mask, whole, *marked = (None if picture is None else picture[0] for picture in pictures)
     if quiet is not None and (quiet.shape != image.shape or float(quiet.max()) > full):
         yield "its noiseless image has another shape or values above its range"
-    if bright is not None and (bright.shape != image.shape or int(bright.max()) > 1):
-        yield "its mask of highlights has another shape or values above 1"
+    for what, marks in zip(("highlights", "lens reflections"), marked, strict=True):
+        if marks is not None and (marks.shape != image.shape or int(marks.max()) > 1):
+            yield f"its mask of {what} has another shape or values above 1"
     if mask is not None:
         yield from _masks(entry, mask, whole, limbus_px)
     yield from _geometry(entry, mask)

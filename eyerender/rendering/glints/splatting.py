@@ -28,11 +28,12 @@ _BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
 
 @dataclass(frozen=True, slots=True)
 class Shine:
-    """Contribution of a mirror image to an image: spots, share of the exposure, circle of confusion (px)."""
+    """Contribution of a mirror image, in the cornea or in a worn lens: spots, share of the exposure, blur disc (px)."""
 
     spots: LampSpots
     share: float
     blur_px: float
+    of_lens: bool = False
 
 
 def add_shines(shines: Sequence[Shine], picture: Singles, job: RenderJob) -> None:
@@ -131,7 +132,7 @@ class MirrorImages:
             shines += [
                 Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
             ]
-        shines += [Shine(defocused(image.spots, blur.subject_px), share, 0.0) for image in self.in_lenses]
+        shines += [Shine(defocused(image.spots, blur.subject_px), share, 0.0, True) for image in self.in_lenses]
         others = tuple((order, glint_table(found[:count])) for order, found in further.items())
         return Mirrored(glint_table(glints[:count]), others, reasons), shines
 

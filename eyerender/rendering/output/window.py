@@ -39,6 +39,8 @@ class RenderedWindow(ArrayValue):
         lid_margins_px: landmarks along the lids, where there are any.
         highlights: (height, width) pixels with highlights of wet and oily surfaces, if they were requested.
         geometry: depth, normals, coordinates on the iris and instances, if they were requested.
+        lens_reflections: (height, width) pixels where worn lenses mirror more light than comes from behind them, before
+            glare and sensor; None without lenses.
     """
 
     window: Window
@@ -53,6 +55,7 @@ class RenderedWindow(ArrayValue):
     lid_margins_px: dict[str, list[list[float]]] | None = None
     highlights: Bools | None = None
     geometry: Geometry | None = None
+    lens_reflections: Bools | None = None
 
     def flipped(self, camera: PinholeCamera) -> RenderedWindow:
         """Return the window turned left to right, with normals in its own frame; `camera` is that before the flip."""
@@ -69,7 +72,7 @@ class RenderedWindow(ArrayValue):
             sign = (-1, 1, 1) if value.shape[2:] == (3,) else 1  # of normals
             return frozen(value[:, ::-1] * np.array(sign, value.dtype), value.dtype)
 
-        names = ("irradiance", "dn", "labels", "glints", "highlights", "geometry")
+        names = ("irradiance", "dn", "labels", "glints", "highlights", "geometry", "lens_reflections")
         lids = {lid: [[last - x, y] for x, y in points] for lid, points in (self.lid_margins_px or {}).items()}
         others = tuple((order, turned(table)) for order, table in self.purkinje)
         changed: dict[str, Any] = {name: turned(getattr(self, name)) for name in names}
@@ -126,10 +129,11 @@ class RawFrame(ArrayValue):
             InputError: numbers so extreme that the image is not finite.
         """
         job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
-        irradiance = self._irradiance(self.exposed[0])
+        irradiance, reflections = self._irradiance(self.exposed[0])
         if len(self.exposed) == 2:
             odd = 1 - job.window[1] % 2
-            irradiance[odd::2] = self._irradiance(self.exposed[1])[odd::2]
+            for both, second in zip((irradiance, reflections), self._irradiance(self.exposed[1]), strict=True):
+                both[odd::2] = second[odd::2]
         irradiance = sealed(irradiance)
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
@@ -142,6 +146,7 @@ class RawFrame(ArrayValue):
             mirrored = mirrored.behind(covered, job.window)
             highlights = None if highlights is None else frozen(highlights & ~covered, np.bool_)
             geometry = None if geometry is None else geometry.behind(covered)
+            reflections &= ~covered
         done = RenderedWindow(
             window=job.window,
             irradiance=irradiance,
@@ -155,15 +160,20 @@ class RawFrame(ArrayValue):
             lid_margins_px=self.lid_margins_px,
             highlights=highlights,
             geometry=geometry,
+            lens_reflections=frozen(reflections, np.bool_) if job.eye.worn else None,
         )
         return done.flipped(job.camera) if job.flip else done
 
-    def _irradiance(self, exposed: Exposed) -> Singles:
-        """Compute the irradiance (height, width) of the window, W/m^2, in one exposure."""
+    def _irradiance(self, exposed: Exposed) -> tuple[Singles, Bools]:
+        """Compute the irradiance (height, width) of the window, W/m^2, in one exposure, and its lens reflections."""
         job = self.job
         # Single precision is finer than the samples' noise, and takes half the time.
         picture = psf.blur(self.blur.of_pictures(exposed.picture).astype(np.float32), job.sensor.psf_sigma_px)
-        add_shines(exposed.glints, picture, job)
+        add_shines([shine for shine in exposed.glints if not shine.of_lens], picture, job)
+        mirrored = np.zeros_like(picture)
+        add_shines([shine for shine in exposed.glints if shine.of_lens], mirrored, job)
+        reflections = mirrored > picture
+        picture += mirrored
         picture = stray.starred(picture, job.lens.star)
         seen = (job.lens, job.camera, job.window)
         picture = _framed(picture, *seen)
@@ -174,7 +184,7 @@ class RawFrame(ArrayValue):
         beyond = job.camera.without_rays(job.window)
         if beyond is not None:
             picture = np.where(beyond, np.float32(0), picture)
-        return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor)))
+        return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor))), reflections
 
     def _around(self, cells: Singles, glints: Sequence[Shine]) -> Singles:
         """Return the whole sensor in blocks, seen through the openings, with the mirror images of the lamps."""
