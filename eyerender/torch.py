@@ -7,7 +7,7 @@ Both datasets yield each image as a mapping with the requested parts:
 | part | value |
 |---|---|
 | `image`, `noiseless` | float32 (1, h, w): codes of the camera as a share of the full scale, 0 to 1 |
-| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the view |
+| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 view frame, 5 spectacles |
 | `highlight_mask` | int64 (h, w): 1 where wet and oily surfaces mirror a lamp |
 | `lens_reflection_mask` | int64 (h, w): 1 where a spectacle lens mirrors more light than comes from behind it |
 | `instance_mask` | int64 (h, w): as `mask`, with 5 skin, 6 upper lid, 7 lower lid, 8 lashes, 9 brow, 10 caruncle |

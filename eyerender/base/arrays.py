@@ -123,6 +123,16 @@ class ArrayValue:
         return hash(tuple(_key(getattr(self, f.name)) for f in dataclasses.fields(self)))  # type: ignore[arg-type]
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Body(ArrayValue):
+    """A matte body of triangles: vertices (n, 3) mm, unit normals (n, 3), faces (m, 3), albedo."""
+
+    vertices: Floats
+    normals: Floats
+    faces: Ints
+    albedo: float
+
+
 class Columns(ArrayValue):
     """Mixin for frozen, slotted dataclasses (`eq=False, kw_only=True`) of arrays with common leading axes.
 

@@ -39,7 +39,7 @@ _MORE = {
     "iris_coordinates": "\n- `iris_coordinates_file_name` (.npz): the place in the plane of the iris that the pixel "
     "shows, mm toward the nose and up from the centre of the pupil.",
     "instances": "\n- `instance_mask_file_name`: 0 background, 1 to 4 as the mask, 5 skin, 6 upper lid, 7 lower lid, "
-    "8 lashes, 9 brow, 10 caruncle, 11 tears of a head mesh.",
+    "8 lashes, 9 brow, 10 caruncle, 11 frame of spectacles, 12 tears of a head mesh.",
 }
 
 

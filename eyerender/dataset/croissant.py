@@ -17,7 +17,11 @@ CROISSANT = "croissant.json"
 _TEXT, _INTEGER = "sc:Text", "sc:Integer"
 _FIELDS = (
     ("file_name", _TEXT, "The image, relative to the dataset's folder"),
-    ("mask_file_name", _TEXT, "The mask: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the view"),
+    (
+        "mask_file_name",
+        _TEXT,
+        "The mask: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 what frames the view, 5 spectacles",
+    ),
     ("sample", _INTEGER, "Which sample of the spec"),
     ("subject", _INTEGER, "Subject; each subject is in one split only"),
     ("split", _TEXT, "Which split"),

@@ -21,6 +21,7 @@ from ..optics.surfaces import Surface
 from ..optics.surfaces_biconic import Biconic
 from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import rotation_x, rotation_y, rotation_z
+from .frames import SpectacleFrame
 from .worn import WornLens
 
 NOMINAL_NM = 546.07
@@ -158,6 +159,10 @@ class SpectacleLens(Spec):
     transmission: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0, description="of the material, along any path"
     )
+    frame: SpectacleFrame | None = Field(
+        default=None,
+        description="what holds the lens, in pictures with a region; default: as `{}`, and none at index 1",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -217,16 +222,18 @@ class SpectacleLens(Spec):
                 (solved.front_mm, solved.back_mm), solved.asphericities, (solved.thickness_mm, 0.0), strict=True
             )
         )
-        shares = self.reflectance
+        shares, index = self.reflectance, self.index_at(wavelength_nm)
+        frame = self.frame or (SpectacleFrame() if index > 1.0 else None)
         return WornLens(
             front=front,
             back=back,
-            index=self.index_at(wavelength_nm),
+            index=index,
             centre_mm=frozen(centre),
             rotation=frozen(turn),
             half_mm=self.outline_mm,
             reflectances=None if shares is None else ((shares, shares) if isinstance(shares, float) else shares),
             transmission=self.transmission,
+            frame=None if frame is None else frame.shape(side, on_rig=on_rig),
         )
 
     def _solved(self) -> _Solved:

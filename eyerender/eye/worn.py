@@ -24,6 +24,20 @@ _REACH = 1.5
 """A leg whose straight line passes the lens's plane farther out than this part of the outline cannot pass the lens."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameShape:
+    """What holds a lens: the keys of `frames.SpectacleFrame`, and the sign of y towards the nose."""
+
+    rims: bool
+    bridge: bool
+    temples: bool
+    round: bool
+    rim_mm: float
+    depth_mm: float
+    albedo: float
+    nasal: float
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WornLens(ArrayValue):
     """A lens in the frame of the unrotated eye or, `turned`, in the frames of n turned eyes; arrays may be batches.
@@ -37,6 +51,7 @@ class WornLens(ArrayValue):
         half_mm: (2,) half axes of the elliptical outline along the lens's y and z.
         reflectances: of front and back at every angle; None: Fresnel's.
         transmission: of the material.
+        frame: what holds the lens, which pictures show; None: nothing.
     """
 
     front: Surface
@@ -47,6 +62,7 @@ class WornLens(ArrayValue):
     half_mm: tuple[float, float]
     reflectances: tuple[float, float] | None
     transmission: float
+    frame: FrameShape | None = None
 
     def turned(self, turn: Floats, shift_mm: Floats) -> WornLens:
         """Express the lens in frames of turned eyes, x = turn x' + shift_mm, with turn (n, 3, 3) and shift (n, 3)."""

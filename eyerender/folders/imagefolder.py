@@ -52,7 +52,7 @@ CONVENTIONS = {
     "values": "sensor counts, linear unless the line's gamma is not 1 (then count / full scale = linear^(1 / gamma)); "
     "exposure belongs to the scene, never to the image",
     "mask": "0 background or skin, 1 sclera, 2 iris, 3 pupil, as seen through the cornea at pixel centres; 4 what "
-    "frames the camera's view (openings of the lens, borders of the sensor)",
+    "frames the camera's view (openings of the lens, borders of the sensor), 5 frame of spectacles",
 }
 
 
@@ -179,7 +179,9 @@ class ImageEntry:
         return image
 
     def mask(self) -> Bytes | None:
-        """Read the class of each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 a frame.
+        """Read the class of each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 and 5 frames.
+
+        Class 4 frames the view, class 5 is the frame of spectacles.
 
         Returns:
             The mask; None if the metadata names none.

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Floats, frozen, remembered, sealed
+from ..base.arrays import ArrayValue, Body, Floats, frozen, remembered, sealed
 from ..optics.surfaces import Surface, components
 from ..optics.transforms import rotated
 from ..optics.vectors import lengths
@@ -35,6 +35,7 @@ class Globe(ArrayValue):
         M: (3, 3) rotation of the motion p = M x + t into the unrotated frame.
         t: (3,) translation of that motion.
         mirrored: whether it is a left eye, whose region's frame has y reversed.
+        frames: what holds the lenses worn before it, in the unrotated frame, also for a left eye.
     """
 
     cornea: Surface | None
@@ -44,6 +45,7 @@ class Globe(ArrayValue):
     M: Floats
     t: Floats
     mirrored: bool = False
+    frames: tuple[Body, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "M", "t"):

@@ -6,13 +6,14 @@ orientation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen, sealed
+from ..base.arrays import ArrayValue, Body, Bools, Floats, Ints, frozen, sealed
 from .anatomy import Region
 from .brow import PLACES as BROW_PLACES
 from .brow import brow
@@ -21,7 +22,7 @@ from .globe import Globe
 from .hairs import SEGMENTS, Hairs, tube_faces
 from .lashes import lashes
 from .lids import CONJUNCTIVA, FINE, LID, MARGIN, ROWS, grid_normals, halved, sheet
-from .skin import BROW, LASH, LASH_U, TEAR, band_row, sheet_v
+from .skin import BANDS, BROW, LASH, LASH_U, SHEET_ROWS, SPECTACLES_ROW, TEAR, band_row, sheet_v
 from .tears import ROWS as TEAR_ROWS
 from .tears import meniscus, on_globe
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     import trimesh
 
 PARTS = ("skin", "lashes", "brow", "tears")
+SPECTACLES = "spectacle frame"  # the part before the tears, if frames of spectacles are worn
 LID_MARKS = 17  # landmarks of a lid in labels
 HAIRS = 2  # the first of a mesh's strands, which are hairs
 
@@ -69,11 +71,16 @@ class RegionMesh(ArrayValue):
     strands: tuple[Floats, ...]
     radii: tuple[Floats, ...]
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts of a procedural region."""
+        return PARTS if len(self.layout.face_ends) == len(PARTS) else (*PARTS[:-1], SPECTACLES, PARTS[-1])
+
     def part(self, name: str) -> trimesh.Trimesh:
         """Return one part as a trimesh: skin, lashes, tears or brow."""
         import trimesh  # its import takes a quarter of a second, and few processes need it
 
-        i = PARTS.index(name)
+        i = self.parts.index(name)
         v0, f0 = (0, 0) if i == 0 else (int(self.layout.vertex_ends[i - 1]), int(self.layout.face_ends[i - 1]))
         v1, f1 = int(self.layout.vertex_ends[i]), int(self.layout.face_ends[i])
         return trimesh.Trimesh(self.vertices[v0:v1], self.layout.faces[f0:f1] - v0, process=False)
@@ -109,7 +116,7 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
         vertices, normals, curves = vertices * mirror, normals * mirror, [c * mirror for c in curves]
     upper, lower, border, *strands = (frozen(c) for c in curves)
     layout = _layout(spec.lashes.upper_count, len(lash.points), len(hair.points), globe.mirrored)
-    return RegionMesh(
+    mesh = RegionMesh(
         vertices=sealed(vertices),
         normals=sealed(normals),
         layout=layout,
@@ -118,6 +125,32 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
         border=border,
         strands=tuple(strands),
         radii=(lash.radii, hair.radii),
+    )
+    return _framed(mesh, globe.frames) if globe.frames else mesh
+
+
+def _framed(mesh: RegionMesh, frames: Sequence[Body]) -> RegionMesh:
+    """Insert frames of spectacles as a part before the menisci."""
+    layout = mesh.layout
+    v, f = (int(ends[-2]) for ends in (layout.vertex_ends, layout.face_ends))
+    starts = v + np.cumsum([0, *(len(body.vertices) for body in frames)])
+    added, row = int(starts[-1]) - v, (SHEET_ROWS + SPECTACLES_ROW) / (SHEET_ROWS + BANDS)
+    own = np.concatenate([body.faces + start for body, start in zip(frames, starts[:-1], strict=True)])
+    uv = np.concatenate([np.full((len(body.vertices), 2), (body.albedo, row)) for body in frames])
+
+    def joined(values: Floats, new: Floats) -> Floats:
+        return np.concatenate([values[:v], new, values[v:]])
+
+    return replace(
+        mesh,
+        vertices=sealed(joined(mesh.vertices, np.concatenate([body.vertices for body in frames]))),
+        normals=sealed(joined(mesh.normals, np.concatenate([body.normals for body in frames]))),
+        layout=RegionLayout(
+            frozen(np.concatenate([layout.faces[:f], own, layout.faces[f:] + added]), np.int64),
+            frozen(joined(layout.uv, uv)),
+            frozen([*layout.vertex_ends[:-1], v + added, layout.vertex_ends[-1] + added], np.int64),
+            frozen([*layout.face_ends[:-1], f + len(own), layout.face_ends[-1] + len(own)], np.int64),
+        ),
     )
 
 

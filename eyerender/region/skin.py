@@ -33,6 +33,7 @@ from .tears import waves
 SHEET_ROWS, BANDS = 960, 64
 _COLUMNS = 1536
 LASH, BROW, TEAR = 0, 1, 2
+SPECTACLES_ROW = BANDS - 4  # texel of the band of spectacle frames, whose albedo is its coordinate u
 LASH_U = (0.05, 0.4)  # coordinate u of an upper lash's root, and how far its tip is from there; lower ones add 1/2
 _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _TILE_MM, _TILE = 24.0, 640
@@ -98,6 +99,7 @@ def skin_map(spec: Region) -> Singles:
         if which == LASH:
             out[band_rows, :, 0], out[band_rows, :, 3] = lash_band(spec)
         if which == TEAR:
+            out[SHEET_ROWS + SPECTACLES_ROW - 3 :, :, 0] = (np.arange(_COLUMNS) + 0.5) / _COLUMNS
             out[band_rows, :, 1:3] = waves(spec, _COLUMNS)[:, None] * _along_lids(rest)
     out.flags.writeable = False
     return out

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from ..base.errors import InputError
-from ..base.spec import FileSpec, KeyProblem, Positive, Side, Spec, Vec2, Vec3
+from ..base.spec import EYES, FileSpec, KeyProblem, Positive, Side, Spec, Vec2, Vec3
 from ..eye.catalogue import load_eye, refuse_unknown
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.spec import EyeSpec
-from ..eye.spectacles import Spectacles
+from ..eye.spectacles import Spectacles, lenses_of
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
@@ -272,6 +272,9 @@ class SceneSpec(FileSpec):
         subject = self.subject
         if subject.spectacles is not None and self.eye.line_of_sight != "chief_ray":
             raise KeyProblem("eye.line_of_sight", "must be chief_ray with subject.spectacles")
+        framed = any(lens.frame for side in EYES for lens in lenses_of(subject.spectacles, side))
+        if framed and (self.region is None or self.region.head is not None):
+            raise KeyProblem("subject.spectacles", "frames are drawn around eyes with a region and without a head mesh")
         if self.person is not None:
             if subject.age_years is not None:
                 raise KeyProblem("subject.age_years", "cannot stand beside a drawn person, who has an age")

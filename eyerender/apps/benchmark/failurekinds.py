@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...base.arrays import Bytes
 from ...optics.ellipse import Ellipse, iou, signed_distance
-from ...scene.parts import BACKGROUND, FRAME
+from ...scene.parts import BACKGROUND, FRAME, SPECTACLES
 from .labelled import BenchImage
 
 FailureKind = Literal["near miss", "glint", "iris", "lash or lid", "shadow", "elsewhere"]
@@ -67,7 +67,7 @@ def _is_like_iris(found: Ellipse, true: Ellipse | None) -> bool:
 
 def _crosses_lid(found: Ellipse, image: BenchImage, inside: NDArray[np.bool_], mask: Bytes | None) -> bool:
     if mask is not None and inside.any():
-        skin = float(np.mean(np.isin(mask[inside], (BACKGROUND, FRAME))))
+        skin = float(np.mean(np.isin(mask[inside], (BACKGROUND, FRAME, SPECTACLES))))
         return _CROSSES <= skin <= 1.0 - _CROSSES
     return any(bool(np.any(signed_distance(found, margin) < 0.0)) for margin in image.lids_px)
 

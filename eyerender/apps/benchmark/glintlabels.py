@@ -13,7 +13,7 @@ from scipy.ndimage import label
 
 from ...base.arrays import Bytes, Floats
 from ...optics.ellipse import Ellipse, signed_distance
-from ...scene.parts import BACKGROUND, FRAME, SCLERA
+from ...scene.parts import BACKGROUND, FRAME, SCLERA, SPECTACLES
 
 MATCH_PX = 2.0  # matching distance for a glint that is a point
 Place = Literal["pupil", "edge", "iris", "sclera", "skin", ""]
@@ -121,7 +121,7 @@ def _place(xy: tuple[float, float], pupil: Ellipse | None, mask: Bytes | None) -
     seen = _class_at(xy, mask)
     if seen is None:
         return ""
-    return "skin" if seen in (BACKGROUND, FRAME) else "sclera" if seen == SCLERA else "iris"
+    return "skin" if seen in (BACKGROUND, FRAME, SPECTACLES) else "sclera" if seen == SCLERA else "iris"
 
 
 def false_kind(xy: tuple[float, float], true: Sequence[TrueGlint], hidden_px: Floats, mask: Bytes | None) -> str:
@@ -141,7 +141,7 @@ def false_kind(xy: tuple[float, float], true: Sequence[TrueGlint], hidden_px: Fl
     if seen is None or mask is None:
         return "elsewhere"
     y, x = np.ogrid[: mask.shape[0], : mask.shape[1]]
-    around = np.isin(mask[np.hypot(x - xy[0], y - xy[1]) < _MARGIN_PX], (BACKGROUND, FRAME))
+    around = np.isin(mask[np.hypot(x - xy[0], y - xy[1]) < _MARGIN_PX], (BACKGROUND, FRAME, SPECTACLES))
     if around.any() and not around.all():
         return "lid margin"
     return "skin" if around.all() else "sclera" if seen == SCLERA else "second reflection"

@@ -119,7 +119,7 @@ class BenchImage:
         return read_any_image(self.path)[0], None if self.mask_path is None else read_image(self.mask_path)[0]
 
     def classes(self) -> Bytes | None:
-        """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 a frame); None if unknown."""
+        """Read the class of each pixel (0 skin, 1 sclera, 2 iris, 3 pupil, 4 or 5 a frame); None if unknown."""
         return None if self.mask_path is None else np.asarray(read_image(self.mask_path)[0], dtype=np.uint8)
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from ...base.arrays import Bytes
 from ...base.errors import InputError
 from ...folders.imagefolder import ImageEntry
-from ...scene.parts import FRAME, IRIS, PUPIL
+from ...scene.parts import IRIS, PUPIL, SPECTACLES
 from .faults import Fault
 from .figures import PICTURE, SATURATED
 
@@ -114,7 +114,7 @@ def _mask(entry: ImageEntry, shape: tuple[int, ...], faults: list[Fault]) -> Byt
     if mask.shape != shape:
         faults.append(Fault("size", f"its mask is {_size(mask)} px, but its picture {shape[1]} x {shape[0]}"))
         return None
-    if mask.dtype != np.uint8 or int(mask.max()) > FRAME:
+    if mask.dtype != np.uint8 or int(mask.max()) > SPECTACLES:
         faults.append(Fault("mask", f"holds the class {int(mask.max())}"))
         return None
     return mask

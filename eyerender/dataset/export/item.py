@@ -113,7 +113,7 @@ class Item:
 
     @cached_property
     def mask(self) -> Bytes:
-        """Mask (h, w): 0 background, skin or frame around the view, 1 sclera, 2 iris, 3 pupil."""
+        """Mask (h, w): 0 background, skin, or frame of the view or of spectacles, 1 sclera, 2 iris, 3 pupil."""
         mask = self.entry.mask()
         return np.zeros(self.image.shape, np.uint8) if mask is None else np.where(mask > PUPIL, BACKGROUND, mask)
 

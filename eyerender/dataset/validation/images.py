@@ -12,11 +12,12 @@ from ...base.arrays import Bools, Floats
 from ...folders.imagefolder import ImageEntry
 from ...imaging.labels import moments_ellipse
 from ...rig.camera import PinholeCamera, Window
-from ...scene.parts import FRAME, IRIS, PUPIL
+from ...scene.parts import FRAME, IRIS, PUPIL, SPECTACLES
 from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
 from .problems import differences
 
 SKIN, SCLERA = 0, 1
+_RIMS = 11  # instance of the frame of spectacles
 _VISIBLE = 1e-8  # relative; numbers of packed lines are rounded to 5e-9
 _UNIT, _FACING = 1e-3, 1e-3  # of normals, which half precision rounds by up to 5e-4
 _EDGES = 1e-3  # share of pixels in which two rays through one place may meet different sides of an edge
@@ -92,7 +93,7 @@ def _geometry(entry: ImageEntry, mask: Mask | None) -> Iterator[str]:
     if instances is None:
         return
     if mask is not None and instances.shape == mask.shape:
-        own = np.where(instances > FRAME, SKIN, instances)
+        own = np.where(instances == _RIMS, SPECTACLES, np.where(instances > FRAME, SKIN, instances))
         if np.count_nonzero(own != mask) > _EDGES * mask.size:
             yield "its mask of instances differs from its mask"
     for name, values, there in (
@@ -119,7 +120,7 @@ def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats 
         if picture.shape != (h, w):
             yield f"its {name} is {_size(picture)} px"
             return
-        if int(picture.max()) > (FRAME if picture is mask else PUPIL):
+        if int(picture.max()) > (SPECTACLES if picture is mask else PUPIL):
             yield f"its {name} holds the value {int(picture.max())}"
     yield from _visible(entry.line, mask, entry.window)
     yield from _outlines(entry.line, mask, whole, limbus_px, entry.window)
@@ -171,7 +172,7 @@ def _outlines(
         if iris is not None:
             yield from _compare(f"{what} of its iris", _iris(picture), (picture == SCLERA) | other, iris, window)
     if whole is not None:
-        if np.any((mask != SKIN) & (mask != FRAME) & (mask != whole)):
+        if np.any(~np.isin(mask, (SKIN, FRAME, SPECTACLES)) & (mask != whole)):
             yield "its mask shows a part that its amodal mask lacks there"
         for name, part, share in zip(("pupil", "iris"), (PUPIL, IRIS), shares, strict=True):
             there = np.count_nonzero(whole == part)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...base.arrays import Bools, Cache, Floats, Singles, frozen
+from ...region.mesh import SPECTACLES
 from ...rig import defocus, psf
 from ...rig.camera import Window
 from ...rig.light import Lamp
@@ -23,7 +24,7 @@ from .tracing import Glint, GlintScene, GlintTable, Image, LampImages, LampSpots
 
 _KNOWN: Cache[list[Image]] = Cache(8)
 _FRAMED = "occluded by frame"
-_BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
+_BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow", SPECTACLES: SPECTACLES}
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,7 +226,7 @@ class FrameBuilder:
         if surroundings is None:
             full, back = len(self._regions) >= _REGIONS, key in self._replaced
             sides = {k for k in self._regions if k[0].seed == spec.seed and k[1] != globe.mirrored}
-            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec) and k not in sides), None)
+            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec, globe) and k not in sides), None)
             if oldest is None or (back and not full):
                 if full:
                     self._regions.pop(next(iter(self._regions)))

@@ -20,9 +20,9 @@ from ...optics.interface import dot
 from ...optics.surfaces import Surface, Xyz
 from ...optics.surfaces_quadric import Quadric
 from ...optics.transforms import rotated
-from ...region.mesh import sheet_codes
+from ...region.mesh import SPECTACLES, sheet_codes
 from ...rig.distortion import is_distorted
-from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
+from ...scene.parts import FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
 from ..hits.primary import behind, facing, hit_before
 from ..integrator.hostdata import BoundFrame
@@ -31,11 +31,11 @@ from ..records.frame import DeviceFrame, aligned_copy
 from ..records.job import RenderJob
 from ..records.recording import recorded
 from ..scene.region import RegionScene
-from .labels import PartLabels, part_of
+from .labels import PartLabels, cover_of, part_of
 
-NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, TEARS = 0, 5, 6, 7, 8, 9, 10, 11
+NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, RIMS, TEARS = 0, 5, 6, 7, 8, 9, 10, 11, 12
 """Instances in addition to the parts of a mask."""
-_PARTS = {"skin": SKIN, "head": SKIN, "lashes": LASHES, "brow": BROW, "tears": TEARS}
+_PARTS = {"skin": SKIN, "head": SKIN, "lashes": LASHES, "brow": BROW, "tears": TEARS, SPECTACLES: RIMS}
 _STRIP = 4096  # rays whose numbers fit into a processor's cache
 _STEPS = 2  # of Newton's method, which rays at a grazing angle need
 _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
@@ -132,7 +132,7 @@ def _hits(
     hit = hit_before(frame, o, d, eye.distance, mi.Bool(True))
     si = behind(eye, hit, mi.Bool(True))
     amodal = part_of(eye)
-    part = instance = dr.select(si.other, mi.UInt8(BACKGROUND), amodal)
+    part = instance = dr.select(si.other, cover_of(frame, hit), amodal)
     away = dr.dot(si.normal, frame.vector_to_eye(d)) > 0
     point, normal = si.point, dr.select(away, -si.normal, si.normal)
     if codes is not None:

@@ -11,11 +11,11 @@ import numpy as np
 
 from ...base.arrays import ArrayValue, Bools, Bytes, frozen, sealed
 from ...rig.camera import Window
-from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
+from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA, SPECTACLES
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import on_water
-from ..hits.primary import first_hit, hidden
+from ..hits.primary import TriangleHit, first_hit, hidden, hit_before
 from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
 from ..records.frame import DeviceFrame
@@ -31,7 +31,8 @@ class PartLabels(ArrayValue):
     """Part at each pixel's centre, seen through the cornea; arrays (height, width).
 
     Attributes:
-        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view.
+        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view, 5
+            frame of spectacles.
         amodal: the same for the eye alone, without occluders.
     """
 
@@ -65,9 +66,20 @@ def _parts(frame: DeviceFrame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
     eye = EyeShape(frame=frame).ray_intersect(o, d)
     amodal = part_of(eye)
-    part = dr.select(hidden(frame, eye, o, d), mi.UInt8(BACKGROUND), amodal)
+    if frame.region is not None and frame.region.spectacles is not None:
+        hit = hit_before(frame, o, d, eye.distance, mi.Bool(True))
+        part = dr.select(hit.is_valid(), cover_of(frame, hit), amodal)
+    else:
+        part = dr.select(hidden(frame, eye, o, d), mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
     return part, amodal
+
+
+def cover_of(frame: DeviceFrame, hit: TriangleHit) -> mi.UInt8:
+    """Return the part at hits before the eye: spectacles or background."""
+    if frame.region is None or frame.region.spectacles is None:
+        return mi.UInt8(BACKGROUND)
+    return dr.select(frame.region.on_spectacles(frame.region.face(hit)), mi.UInt8(SPECTACLES), mi.UInt8(BACKGROUND))
 
 
 def part_of(eye: SurfaceInteraction) -> mi.UInt8:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...base.arrays import ArrayValue, Bools, Floats, frozen, remembered
 from ...base.errors import InputError
 from ...eye.entrance import entrance_pupil
+from ...eye.frames import frame_body
 from ...eye.fundus import FundusLight, Spread, fundus_light
 from ...eye.legs import air_legs, apparent_places
 from ...eye.model import EyeModel
@@ -151,6 +152,7 @@ def globe_of(eye: EyeModel, M: Floats, t: Floats) -> Globe:
         M=M,
         t=t,
         mirrored=eye.side == "left",
+        frames=tuple(body for lens in eye.worn if (body := frame_body(lens)) is not None),
     )
 
 

@@ -28,8 +28,12 @@ class HeadScene(RegionScene):
         InputError: the mesh cannot be read, or reaches into the cornea in the eye's pose.
     """
 
-    parts = HEAD_PARTS
     fixed = True
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts."""
+        return HEAD_PARTS
 
     def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
         super().__init__(spec, globe, known)

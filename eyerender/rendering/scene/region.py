@@ -22,7 +22,7 @@ from ...region.globe import Globe
 from ...region.head import file_states
 from ...region.lids import FINE, ROWS
 from ...region.mapcache import kept
-from ...region.mesh import PARTS, RegionLayout, RegionMesh, region_mesh, sheet_ends
+from ...region.mesh import SPECTACLES, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ...region.skin import SHEET_ROWS, sheet_v, skin_texels
 from ..records.frame import aligned_copy
 from .background import clear_between, rays_between
@@ -45,7 +45,6 @@ class RegionScene:
     """
 
     obstructed = True
-    parts: tuple[str, ...] = PARTS
     fixed = False  # whether the mesh keeps still, and has no menisci that light passes through
 
     def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
@@ -77,6 +76,7 @@ class RegionScene:
 
     def _dress(self, spec: Region, globe: Globe, posed: RegionMesh) -> None:
         """Copy the appearance of a subject to the device."""
+        self.posed = posed
         texture: Any = mi.Texture2f16  # half the memory to read; albedo and slope need no more digits
         pixels = aligned_copy(self._look(spec))
         look = texture(mi.TensorXf16(pixels), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
@@ -84,18 +84,31 @@ class RegionScene:
         inner = self._inner()
         thin = 0.0 if spec.skin.map == "off" else float(sheet_v(np.array(_THIN_ROWS / (ROWS - 1))))
         self.skin = SkinGeometry.of(look, posed.layout, mirror, thin, inner, self._water)
+        if SPECTACLES in self.parts:
+            first, last = (dr.opaque(mi.UInt32, int(end)) for end in posed.layout.face_ends[-3:-1])
+            self.skin.spectacles = first, last
         self.relief = {} if inner is None else _mean_slopes(pixels)
         self.sheet_faces = int(posed.layout.face_ends[0])
         self._records = np.zeros((len(posed.layout.uv), 8), np.float32)
         self._records[:, 3], self._records[:, 7] = posed.layout.uv.T
         self._pose_skin(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
-        self.posed = posed
         self.subject = self.key(spec, globe)
 
-    def takes(self, spec: Region) -> bool:
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts."""
+        return self.posed.parts
+
+    def takes(self, spec: Region, globe: Globe) -> bool:
         """Return whether a subject fits the meshes of the scene."""
-        return not self.fixed and spec.head is None
+        worn = sum(len(body.faces) for body in globe.frames)
+        return not self.fixed and spec.head is None and self.spectacle_faces == worn
+
+    @property
+    def spectacle_faces(self) -> int:
+        """Number of triangles of frames of spectacles."""
+        return int(np.diff(self.posed.layout.face_ends[-3:-1])[0]) if SPECTACLES in self.parts else 0
 
     def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
         """Replace the subject by one with the same shapes, so that recordings remain valid."""
@@ -109,7 +122,8 @@ class RegionScene:
     def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
         """Return the cache key of a scene: the subject, the side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
-        return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files
+        worn = tuple((len(body.faces), body.albedo) for body in globe.frames)
+        return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files, worn
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
         """Pose lids and lashes, including a blink; the mesh of the pose may already be computed."""
@@ -225,6 +239,7 @@ class SkinGeometry:
         film: number of the first triangle of the menisci.
         mirror: -1 for a left eye, else 1.
         thin: coordinate v of the map at which the conjunctiva has its full thickness; 0 without a map.
+        spectacles: numbers of the first triangle of the frame of spectacles, and of the first one behind; None without.
     """
 
     map: Any
@@ -237,6 +252,7 @@ class SkinGeometry:
     film: mi.UInt32
     mirror: mi.Float
     thin: mi.Float
+    spectacles: tuple[mi.UInt32, mi.UInt32] | None = None
 
     @classmethod
     def of(
@@ -331,6 +347,13 @@ class SkinGeometry:
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
         """Return whether a triangle belongs to the sheet of skin rather than to something in front of it."""
         return face < self.sheet
+
+    def on_spectacles(self, face: mi.UInt32) -> mi.Bool:
+        """Return whether a triangle belongs to the frame of spectacles."""
+        if self.spectacles is None:
+            return mi.Bool(False)
+        first, last = self.spectacles
+        return (face >= first) & (face < last)
 
     def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
         """Choose a vertex of triangles at random, by barycentric weight, from a uniform u in [0, 1)."""

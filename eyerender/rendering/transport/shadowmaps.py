@@ -58,8 +58,8 @@ class ShadowMaps:
         if not skin.is_sheet:
             return cls(table=views, known=known, marks=dr.zeros(mi.UInt8, 1))
         pieces = _pieces(region.posed)
-        counts = region.sheet_faces, len(pieces)
-        on_device = dr.opaque(mi.UInt32, counts[0]), dr.opaque(mi.UInt32, counts[1])
+        counts = region.sheet_faces, len(pieces), region.spectacle_faces
+        on_device = tuple(dr.opaque(mi.UInt32, count) for count in counts)
         hairs = upload_array(pieces if len(pieces) else np.zeros(8))
         return cls(table=views, known=known, marks=_marked(views, skin, hairs, on_device, counts, len(table)))
 
@@ -74,15 +74,15 @@ class ShadowMaps:
 
 @recorded
 def _marked(
-    table: mi.Float, skin: SkinGeometry, hairs: mi.Float, on_device: tuple[mi.UInt32, mi.UInt32],
-    counts: tuple[int, int], lamps: int,
+    table: mi.Float, skin: SkinGeometry, hairs: mi.Float, on_device: tuple[mi.UInt32, ...],
+    counts: tuple[int, ...], lamps: int,
 ) -> mi.UInt8:  # fmt: skip
-    """Compute the marks of all lamps, from triangles of the sheet and from pieces of hairs.
+    """Compute the marks of all lamps, from triangles of the sheet, pieces of hairs, and frames of spectacles.
 
     Their `counts` are passed on the device too, otherwise they would be compiled into the kernels.
     """
     marks = dr.zeros(mi.UInt8, max(lamps, 1) * _CELLS * _CELLS)
-    for count, number, mark in zip(counts, on_device, (_mark_triangles, _mark_hairs), strict=True):
+    for count, number, mark in zip(counts, on_device, (_mark_triangles, _mark_hairs, _mark_spectacles), strict=True):
         if count and lamps:
             index = dr.arange(mi.UInt32, count * lamps)
             lamp = index // number
@@ -101,6 +101,14 @@ def _mark_triangles(
     places = [view.place(p) for p in (a, b, c)]
     edge = _Edge.longest([p.u for p in places], [p.v for p in places])
     _mark(marks, lamp, places, mi.Float(0), edge, view.scale, special | (front <= limit))
+
+
+def _mark_spectacles(
+    marks: mi.UInt8, lamp: mi.UInt32, view: _View, index: mi.UInt32, skin: SkinGeometry, hairs: mi.Float
+) -> None:
+    """Mark the cells that triangles of frames of spectacles may cover."""
+    assert skin.spectacles is not None
+    _mark_triangles(marks, lamp, view, skin.spectacles[0] + index, skin, hairs)
 
 
 def _mark_hairs(
