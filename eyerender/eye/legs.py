@@ -164,6 +164,7 @@ class LensImage:
         surface: front or back.
         index: number of the image in this surface; further lenses go on counting.
         status: of the image; the numbers below are NaN where it is not OK.
+        met_mm: (3,) where light of the lamp first meets a lens.
         seen_mm: (3,) the last point on the way to the camera.
         mirror_mm: (3,) the mirror point.
         leaving: (3,) unit direction in which the light leaves the lamp.
@@ -176,6 +177,7 @@ class LensImage:
     surface: str
     index: int
     status: Status
+    met_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
     seen_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
     mirror_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
     leaving: Floats = field(default_factory=partial(np.full, 3, np.nan))
@@ -242,7 +244,8 @@ def _add_images(
             if all(np.linalg.norm(points[i, k] - other.mirror_mm) >= _SAME_MM for other in images[i]):
                 one = LensImage(
                     lamp=i, surface=surface, index=len(images[i]), status=Status.OK,
-                    seen_mm=traced.points_mm[1, i, k], mirror_mm=points[i, k], leaving=leaving[i, k],
+                    met_mm=traced.points_mm[-1, i, k], seen_mm=traced.points_mm[1, i, k],
+                    mirror_mm=points[i, k], leaving=leaving[i, k],
                     share=float(share[i, k]), cross_section_mm2_sr=abs(float(shot.determinant_mm2_sr[i, k])),
                     residual_mm=float(shot.residual_mm[i, k]),
                 )  # fmt: skip

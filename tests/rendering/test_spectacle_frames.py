@@ -20,6 +20,7 @@ from eyerender.imaging.folder import export_scene
 from eyerender.imaging.images import render
 from eyerender.imaging.labels import image_labels
 from eyerender.region.globe import Globe
+from eyerender.rendering.glints.splatting import MirrorImages
 from eyerender.scene import Scene
 from eyerender.scene.parts import PUPIL, SPECTACLES
 from eyerender.scene.spec import SceneSpec
@@ -102,8 +103,7 @@ def test_the_frame_casts_the_shadows_of_its_mesh_on_skin():
     body, job = body_of(worn)
     deep = replace(render_job(bare.frames(), 0), geometry=("depth",))
     depth = make_renderer("auto", None).render(deep).geometry.depth
-    v, u = np.meshgrid(np.arange(4, 236, 9), np.arange(4, 316, 9), indexing="ij")
-    v, u = v.ravel(), u.ravel()
+    v, u = (grid.ravel() for grid in np.meshgrid(np.arange(4, 236, 9), np.arange(4, 316, 9), indexing="ij"))
     ways = job.camera.rays(np.stack([u, v], axis=-1).astype(float))
     ways /= (ways @ job.camera.axis)[:, None]
     points = job.camera.nodal_point_mm + depth[v, u, None] * ways - job.anchor_mm
@@ -140,6 +140,21 @@ def test_pupil_and_glint_behind_the_rim_are_hidden_by_it():
     x, y = np.rint(truth.glints.xy_px[0, 0]).astype(int)
     assert image.parts[y, x] == SPECTACLES
     assert (image.rendered.labels.amodal == PUPIL).sum() > (image.parts == PUPIL).sum()
+
+
+def test_what_stands_before_a_lens_hides_its_reflections():
+    """The wide holder of a small insert before spectacles; the insert itself bends and mirrors nothing."""
+    marked = []
+    for rims in (False, True):
+        frame = {"rims": rims, "rim_mm": 20.0}
+        holder = CLEAR | {"outline_mm": [9.0, 9.0], "vertex_mm": 25.0, "mount": "rig", "frame": frame}
+        worn = scene([{"sphere_d": -2.0}, holder])
+        # Each lens has its own reflections, and lamps have them where the observer traces them.
+        images = MirrorImages.of(render_job(worn.frames(), 0), None).in_lenses
+        assert np.abs(np.stack([one.xy_px[0] for one in images]) - trace(worn).lens_glints.xy_px[0]).max() < 0.002
+        marked.append(render(worn.frames()[0]).lens_reflections.sum())
+    assert marked[0] > 20
+    assert marked[1] == 0
 
 
 @pytest.mark.parametrize(("mount", "parts"), [("head", 3), ("rig", 1)])

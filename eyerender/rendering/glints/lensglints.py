@@ -34,9 +34,16 @@ def lens_reflections(
         lamp = lamps[found.lamp]
         emitters = Emitters.of([lamp], [_NODES if lamp.radius_mm > 0 else POINT])
         near = lens_images(lenses, emitters.points - anchor_mm, camera, found.mirror_mm[None])
-        rows = {one.lamp: one for one in near if one.surface == found.surface}
-        out += still.pictured(emitters, _paths([rows[k] for k in range(len(emitters.points))], camera))
+        rows = [_nearest([one for one in near if one.lamp == k], found) for k in range(len(emitters.points))]
+        out += still.pictured(emitters, _paths(rows, camera))
     return out
+
+
+def _nearest(images: Sequence[LensImage], found: LensImage) -> LensImage:
+    """Return the image in the same surface as `found`; of several lenses, the one whose mirror point is nearest."""
+    own = [one for one in images if one.surface == found.surface]
+    away = [np.linalg.norm(one.mirror_mm - found.mirror_mm) for one in own]
+    return own[int(np.argmin(np.nan_to_num(away, nan=np.inf)))]
 
 
 def defocused(spots: LampSpots, diameter_px: float) -> LampSpots:
@@ -54,8 +61,8 @@ def _paths(images: Sequence[LensImage], camera_mm: Floats) -> LightPaths:
     def column(name: str, otherwise: object) -> Floats:
         return np.array([getattr(one, name) if t else otherwise for one, t in zip(images, there, strict=True)], float)
 
-    seen = column("seen_mm", [1.0, 0.0, 0.0])
+    met, seen, arrives = (column(name, [1.0, 0.0, 0.0]) for name in ("met_mm", "seen_mm", "leaving"))
     return LightPaths(
-        entry=seen, exit=seen, arrives=column("leaving", [1.0, 0.0, 0.0]), leaves=normalize(camera_mm - seen),
+        entry=met, exit=seen, arrives=arrives, leaves=normalize(camera_mm - seen),
         passed=column("share", 0.0), cross_section=column("cross_section_mm2_sr", 1.0), found=there, there=there,
     )  # fmt: skip

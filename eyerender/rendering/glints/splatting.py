@@ -133,7 +133,8 @@ class MirrorImages:
             shines += [
                 Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
             ]
-        shines += [Shine(defocused(image.spots, blur.subject_px), share, 0.0, True) for image in self.in_lenses]
+        in_lenses = self.scene.seen(self.in_lenses, clear) if self.in_lenses else []
+        shines += [Shine(defocused(glint.spots, blur.subject_px), share, 0.0, True) for glint in in_lenses]
         others = tuple((order, glint_table(found[:count])) for order, found in further.items())
         return Mirrored(glint_table(glints[:count]), others, reasons), shines
 
