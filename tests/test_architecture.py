@@ -239,13 +239,13 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 91040,  # what datasets teach by mistake; files of other programs; eyes behind glasses and frames, for users
+    "": 91240,  # what datasets teach by mistake; files of other programs; eyes behind glasses and frames, for users
     "analytic": 1045,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 16900,  # two rigs compared, for their makers; jitter of extractors in recordings, for their users
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2650,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 10260,  # the codes that cameras stored in every export, shards of a stated size, for trainers
+    "dataset": 10270,  # the codes that cameras stored in every export, shards of a stated size, for trainers
     "design": 3530,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
     "eye": 4290,  # spectacle lenses from prescriptions or as made, their frames; fixation, legs of rays, for the same
