@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from ..apps.rigs.options import RigSize
 from ..base.errors import InputError
 from .app import app
-from .options import OutputFolder, Overwrite, Result
+from .options import Overwrite, Result
 from .output import emit, progress
 from .population import read_population
 
@@ -18,7 +18,7 @@ from .population import read_population
 @app.command(name="rig")
 def rig(
     *scenes: str,
-    output: OutputFolder | None = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"], help="The folder to write.")] = None,
     population: str = "adults",
     size: Annotated[RigSize, Parameter(name="*")] = RigSize(),
     unknowns: Path | None = None,

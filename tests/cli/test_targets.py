@@ -102,6 +102,7 @@ def test_every_command_and_every_output_is_in_the_table():
         "scene", "images", "folder", "other", "spec", "records", "rig", "columns", "targets", "calibration", "eye",
         "eyes", "name", "preset", "extractor", "estimator", "reference", "function", "terms_x", "terms_y", "fixations",
         "side", "shard", "address", "against", "recording", "population", "unknowns", "require", "folders", "scenes",
+        "roi", "tolerances",
     }  # fmt: skip
     for name in sorted(names):
         function = (gaze[name[5:]] if " " in name else app[name]).default_command

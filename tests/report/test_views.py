@@ -60,7 +60,18 @@ def test_printed_eye_loads_back_as_the_same_eye(tmp_path, capsys):
         assert load_eye(tmp_path / "eye.yaml") == load_eye(name)
     assert run(["eyes", "--json", "-"]) == 0
     names = [e["name"] for e in json.loads(capsys.readouterr().out)["eyes"]]
-    assert names == ["E1", "E2", "E3", "E4", "E5", "E5-published", "E5-published-stop", "keratoconus"]
+    assert names == [
+        "E1",
+        "E2",
+        "E3",
+        "E4",
+        "E5",
+        "E5-published",
+        "E5-published-stop",
+        "adult",
+        "artificial",
+        "keratoconus",
+    ]
 
 
 def test_purkinje_images_on_demand(capsys):
