@@ -506,8 +506,8 @@ class PinholeCamera(ArrayValue):
         """Compute the coordinates that the distortion maps, from points or directions (..., 3) in the camera's frame.
 
         Returns:
-            x and y (...): X/Z and Y/Z, or for a fisheye the angle from the axis times (X, Y) / |(X, Y)|; NaN where the
-            lens has no image; and whether it has one (...).
+            x and y (...): X/Z and Y/Z, or for a fisheye the angle from the axis times the unit vector along (X, Y); NaN
+            where the lens has no image; and whether it has one (...).
         """
         x, y, z = (points[..., k] for k in range(3))
         if not self.is_fisheye:
