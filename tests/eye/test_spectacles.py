@@ -239,7 +239,7 @@ def test_random_rays_through_random_lenses_agree_with_root_finding_in_high_preci
         ({"surfaces": {"front_radius_mm": 90.0, "back_radius_mm": 60.0, "thickness_mm": 2.0, "index": 0.5}},
          "surfaces.index: must be >= 1"),
         ({"reflectance": [0.1, 1.5]}, "reflectance.1: must be < 1"),
-        ({"frame": {}}, "frame: unknown key"),
+        ({"frames": {}}, "frames: unknown key"),
     ],
 )  # fmt: skip
 def test_what_is_refused(given, message):

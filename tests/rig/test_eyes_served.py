@@ -79,7 +79,7 @@ def test_estimators_calibrate_each_eye_on_its_own_ring():
     assert moments.index.instant.tolist() == list(range(9))
     assert mean.ok.sum() >= 7
     np.testing.assert_allclose(mean.point_mm[4], gaze.point_mm[seen.index.instant == 4].mean(axis=0))
-    with pytest.raises(InputError, match=r"needs 10 lights .*, but the rig has 8 for each eye"):
+    with pytest.raises(InputError, match="there is no light 9: the rig has 8 for each eye"):
         Homography(lights=tuple(range(10))).fit(seen, both.rig)  # type: ignore[arg-type]
 
 
