@@ -97,7 +97,8 @@ def test_no_link_is_followed_to_a_file_of_a_fixed_name_in_a_folder():
 def test_closed_streams_are_no_error(closed):
     command = ["sh", "-c", f"{sys.executable} -P -m eyerender eyes {closed}"]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    assert (done.returncode, done.stderr) == (0, "")
+    said = [line for line in done.stderr.splitlines() if not line.startswith("compiling")]
+    assert (done.returncode, said) == (0, [])
 
 
 def test_only_these_functions_print():

@@ -323,7 +323,7 @@ def test_bad_input(place, capsys, argv, code, words):
     before = sorted(str(p) for p in place.rglob("*"))
     assert run(argv) == code
     out, err = capsys.readouterr()
-    lines = [line for line in err.splitlines() if not line.startswith(("extracting:", "rendering:"))]
+    lines = [line for line in err.splitlines() if not line.startswith(("extracting:", "rendering:", "compiling"))]
     assert len(lines) == 1, err
     assert lines[0].startswith("error: ")
     assert words in lines[0]
