@@ -114,10 +114,15 @@ def whitened_slopes(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) ->
     return across, slopes.glints * weight[..., None, None]
 
 
+def whitened_rows(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> Floats:
+    """Compute derivatives over noise of all features in n views, (n, features, columns of the derivatives)."""
+    across, glints = whitened_slopes(slopes, noise, camera)
+    return np.concatenate([across, glints.reshape(len(camera), -1, across.shape[2])], axis=1)
+
+
 def information_of_views(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> Floats:
     """Compute the information (n, 35, 35) of outline and glints in each view, the first two sums of equation (3)."""
-    across, glints = whitened_slopes(slopes, noise, camera)
-    rows = np.concatenate([across, glints.reshape(len(camera), -1, COUNT)], axis=1)
+    rows = whitened_rows(slopes, noise, camera)
     return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
 
 

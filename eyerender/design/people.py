@@ -217,7 +217,7 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
         openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
         numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
         seen = [
-            _lids_apart(replace(instants, camera=number), theta, camera, openings)
+            seen_features(replace(instants, camera=number), theta, camera, openings)[0]
             for number, camera in zip(numbers, rig.cameras, strict=True)
         ]
         for part, noise in zip(parts, noises, strict=True):
@@ -227,9 +227,12 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
     return [joined(part) for part in parts]
 
 
-def _lids_apart(views: Views, theta: Floats, camera: PinholeCamera, openings: Floats | None) -> FeatureSlopes:
+def seen_features(
+    views: Views, theta: Floats, camera: PinholeCamera, openings: Floats | None, free: Bools | None = None
+) -> tuple[FeatureSlopes, Ints]:
+    """Trace the features of the views of one camera, and remove those that the lids hide, as `visible` does."""
     lit = None if openings is None else mirror_points(views, theta)
-    return visible(slopes_of(views, theta, POINTS), camera, openings, lit, views.lights_mm)[0]
+    return visible(slopes_of(views, theta, POINTS, free), camera, openings, lit, views.lights_mm)
 
 
 def mirror_points(views: Views, theta: Floats) -> Floats:
@@ -267,9 +270,7 @@ def _of_group(survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, peop
     free = Unknowns.from_mapping(survey.unknowns).free()
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        slopes = slopes_of(views, case.theta, POINTS, free)
-        lit = None if openings is None else mirror_points(views, case.theta)
-        slopes, why = visible(slopes, camera, openings, lit, views.lights_mm)
+        slopes, why = seen_features(views, case.theta, camera, openings, free)
         matrices += information_of_views(slopes, noise, views.camera)
         outline = np.maximum(outline, slopes.outline_ok.mean(axis=1))
         glints |= slopes.glint_ok

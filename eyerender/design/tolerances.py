@@ -27,11 +27,12 @@ from ..rig.camera import Camera, Mirror, PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
 from ..scene.spec import SceneSpec
-from .information import information_of_views, whitened_slopes
+from .crowd import OUTLINE
+from .information import information_of_views, whitened_rows
 from .noise import FeatureNoise
-from .people import CALIBRATION_CELLS, GRID, POINTS, RigPopulation, cases_of, learned, mirror_points, visible
+from .people import CALIBRATION_CELLS, GRID, POINTS, RigPopulation, cases_of, learned, seen_features
 from .unknowns import Unknowns
-from .varied import FeatureSlopes, ModelFeatures, Views, gaze_slopes, images_of, slopes_of
+from .varied import FeatureSlopes, Views, gaze_slopes, images_of
 
 _STEP = 0.1  # of a standard deviation, for derivatives by central differences
 UNITS = 200
@@ -124,9 +125,7 @@ class _Axis:
     moved: Callable[[float], RigGeometry]
 
 
-def unit_errors(
-    survey: RigPopulation, tolerances: Tolerances, noise: FeatureNoise, people: int, least_outline: float
-) -> UnitErrors:
+def unit_errors(survey: RigPopulation, tolerances: Tolerances, noise: FeatureNoise, people: int) -> UnitErrors:
     """Compute errors of gaze by the tolerances of a rig, equation (8), for the first people of a population.
 
     Raises:
@@ -140,7 +139,7 @@ def unit_errors(
     return UnitErrors(
         errors_deg=frozen(errors),
         tolerance=frozen([axis.tolerance for axis in axes], np.int64),
-        covered=frozen((glints >= enough) & (outline >= least_outline), bool),
+        covered=frozen((glints >= enough) & (outline >= OUTLINE), bool),
     )
 
 
@@ -232,23 +231,16 @@ def _of_group(
     glints, outline = np.zeros((i, len(rig.lights)), dtype=bool), np.zeros(i)
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        lit = None if openings is None else mirror_points(views, case.theta)
-        slopes, _ = visible(slopes_of(views, case.theta, POINTS, free), camera, openings, lit, views.lights_mm)
+        slopes, _ = seen_features(views, case.theta, camera, openings, free)
         matrices += information_of_views(slopes, noise, views.camera)
         outline, glints = np.maximum(outline, slopes.outline_ok.mean(axis=1)), glints | slopes.glint_ok
-        rows = _whitened(slopes, noise, views.camera)
+        rows = whitened_rows(slopes, noise, views.camera)
         for k, axis in enumerate(axes):
             if number in axis.cameras:
                 pulls[k] += np.einsum("nra,nr->na", rows, _changes(views, case.theta, slopes, noise, axis))
     errors = _errors(case, matrices, pulls, noise, survey, np.array([axis.before for axis in axes]))
     shape = (-1, GRID * GRID)
     return errors.reshape(*shape, len(axes), 2), glints.sum(axis=1).reshape(shape), outline.reshape(shape)
-
-
-def _whitened(slopes: FeatureSlopes, noise: FeatureNoise, camera: Ints) -> Floats:
-    """Return derivatives over noise of all features of views, (n, features, columns)."""
-    across, glints = whitened_slopes(slopes, noise, camera)
-    return np.concatenate([across, glints.reshape(len(camera), -1, across.shape[2])], axis=1)
 
 
 def _changes(views: Views, theta: Floats, slopes: FeatureSlopes, noise: FeatureNoise, axis: _Axis) -> Floats:
@@ -260,9 +252,8 @@ def _changes(views: Views, theta: Floats, slopes: FeatureSlopes, noise: FeatureN
         moved: Floats = (getattr(ahead, name) - getattr(behind, name)) / (2.0 * _STEP)
         return np.where(np.isfinite(moved), moved, 0.0)[..., None]
 
-    one: ModelFeatures = slopes.images
-    moving = replace(slopes, images=one, outline=change("outline_px"), glints=change("glints_px"))
-    return _whitened(moving, noise, views.camera)[..., 0]
+    moving = replace(slopes, outline=change("outline_px"), glints=change("glints_px"))
+    return whitened_rows(moving, noise, views.camera)[..., 0]
 
 
 def _errors(

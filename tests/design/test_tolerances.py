@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 import eyerender as er
 from eyerender.cli.main import run
 from eyerender.design import people, tolerances
+from eyerender.design.information import whitened_rows
 from eyerender.design.noise import FeatureNoise
 from eyerender.design.tolerances import Tolerances, unit_errors
 from eyerender.design.unknowns import LOCAL, Unknowns
@@ -67,7 +68,7 @@ def solved_deg(survey, axis, cell):
         seen = images_of(views, at, people.POINTS)
         gap = {name: np.nan_to_num(getattr(seen, name) - getattr(data, name)) for name in ("outline_px", "glints_px")}
         as_slopes = replace(slopes, outline=gap["outline_px"][..., None], glints=gap["glints_px"][..., None])
-        features = tolerances._whitened(as_slopes, noise, views.camera)
+        features = whitened_rows(as_slopes, noise, views.camera)
         start, direction = lines_of_sight(views, at)
         aim = target - start
         aim /= np.linalg.norm(aim, axis=1, keepdims=True)
@@ -96,7 +97,7 @@ def solved_deg(survey, axis, cell):
 def test_errors_are_those_of_solved_scenes(survey, one, when, axis):
     given = Tolerances.from_mapping({"tolerances": [{**one, "when": when}]})
     scene = er.Scene.of(er.load_scene("headset").spec)
-    found = unit_errors(survey, given, FeatureNoise.of(0.2, 0.1, rig=scene.rig), 1, 0.6)
+    found = unit_errors(survey, given, FeatureNoise.of(0.2, 0.1, rig=scene.rig), 1)
     moving = list(tolerances.axes_of(scene, given))[axis]
     expected = solved_deg(survey, moving, 20)
     np.testing.assert_allclose(found.errors_deg[0, 20, axis], expected, rtol=0.05, atol=0.002)
@@ -108,7 +109,7 @@ def test_units_are_drawn_from_the_axes(survey):
         {"tolerances": [{**ROTATION, "when": "after"}, {**ROTATION, "sd": 0.4, "when": "after"}]}
     )
     scene = er.Scene.of(er.load_scene("headset").spec)
-    found = unit_errors(survey, given, FeatureNoise.of(0.2, 0.1, rig=scene.rig), 2, 0.6)
+    found = unit_errors(survey, given, FeatureNoise.of(0.2, 0.1, rig=scene.rig), 2)
     small, large = found.by_tolerance(2)
     assert large == pytest.approx(2 * small, rel=1e-3)
     drawn = found.of_units(0, 2000).reshape(2, 2000, -1)

@@ -21,7 +21,6 @@ from ...base.errors import InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json
 from ...design.crowd import (
-    OUTLINE,
     SHIFTS_MM,
     coverage_of,
     covered,
@@ -118,10 +117,9 @@ def run_rig(
         data = summary(scene, survey, found, biases, noise, whole.rig)
         data["estimators_on_images"] = _errors_of(pictured)
         data["slippage"] = _slippage_of(*slipped)
-        data |= tolerated(survey, own, scene.rig, min(UNIT_PEOPLE, size.people))
-        if tolerances is not None:
-            for row, one in zip(data["tolerances"], tolerances.tolerances, strict=True):
-                row["number"] = one.number
+        data |= {"tolerances": None, "units": None}
+        if tolerances is not None and own is not None:
+            data |= tolerated(survey, tolerances, own, scene.rig, min(UNIT_PEOPLE, size.people))
         write_json(folder / SUMMARY, data)
         _write_people(folder / PEOPLE, found)
         _write_gaze(folder / GAZE, survey, found)
@@ -150,14 +148,14 @@ def of_this_eye(scene: Scene, tolerances: Tolerances) -> Tolerances:
     return tolerances.model_copy(update={"tolerances": tuple(out)})
 
 
-def tolerated(survey: RigPopulation, tolerances: Tolerances | None, rig: RigGeometry, people: int) -> dict[str, Any]:
-    """Compute what each tolerance costs, and the errors of drawn units; nulls without tolerances.
+def tolerated(
+    survey: RigPopulation, tolerances: Tolerances, own: Tolerances, rig: RigGeometry, people: int
+) -> dict[str, Any]:
+    """Compute what each tolerance costs, and the errors of drawn units; `own` counts the parts of this eye's rig.
 
     The estimator weights features as `MaximumLikelihood` does.
     """
-    if tolerances is None:
-        return {"tolerances": None, "units": None}
-    found = unit_errors(survey, tolerances, FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=rig), people, OUTLINE)
+    found = unit_errors(survey, own, FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=rig), people)
     rows = tolerances.to_mapping()["tolerances"]
     costs = found.by_tolerance(len(rows))
     return {
