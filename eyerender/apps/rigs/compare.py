@@ -28,7 +28,7 @@ from ...report.page import Card, Page, Section, Table, number, write_page
 from ...scene import Scene
 from ...scene.people import Population
 from .options import RigSize
-from .report import REPORT, SUMMARY, estimator_errors, survey_of
+from .report import REPORT, SUMMARY, estimator_errors, survey_of, traits_of
 
 SCHEMA = "eyerender/rig-comparison/1"
 EQUAL = "equal"
@@ -177,13 +177,8 @@ def _row(a: Compared, b: Compared, name: str, who: Any) -> dict[str, Any]:
 
 def _traits(population: Population, seed: int, subjects: Any) -> dict[str, Floats]:
     """Return traits of the people: age, opening of the lids, distance of the pupils."""
-    people = [population.person(int(subject), seed) for subject in subjects]
-    lids = [person.region().fissure for person in people]
-    return {
-        "age": np.array([person.number("age_years") for person in people]),
-        "opening of the lids": np.array([lid.upper_mm + lid.lower_mm for lid in lids]),
-        "distance of the pupils": np.array([person.ipd_mm for person in people]),
-    }
+    age, opening, _, ipd = np.array([traits_of(population.person(int(subject), seed)) for subject in subjects]).T
+    return {"age": age, "opening of the lids": opening, "distance of the pupils": ipd}
 
 
 def _for_whom(a: Compared, b: Compared, traits: dict[str, Floats]) -> list[dict[str, Any]]:

@@ -443,7 +443,7 @@ def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) ->
     rows = [
         [str(found.subject[k]), f"{100 * seen[k]:.0f} %", f"{found.glints[k].mean():.1f}",
          f"{100 * found.outline[k].mean():.0f} %", degrees_text(finite_or_none(noise[k])),
-         *_traits_of(population.person(int(found.subject[k]), survey.seed))]
+         *_traits_as_text(population.person(int(found.subject[k]), survey.seed))]
         for k in worst
     ]  # fmt: skip
     shares = data["coverage"]
@@ -466,11 +466,15 @@ def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) ->
     return Section("For whom does it fail?", *tables)
 
 
-def _traits_of(person: Person) -> list[str]:
-    """Return a person's `TRAITS` as text."""
+def traits_of(person: Person) -> tuple[float, float, float, float]:
+    """Return a person's `TRAITS`."""
     fissure = person.region().fissure
-    opening = f"{fissure.upper_mm + fissure.lower_mm:.1f}"
-    return [f"{person.number('age_years'):.0f}", opening, f"{fissure.width_mm:.1f}", f"{person.ipd_mm:.1f}"]
+    return person.number("age_years"), fissure.upper_mm + fissure.lower_mm, fissure.width_mm, person.ipd_mm
+
+
+def _traits_as_text(person: Person) -> list[str]:
+    age, *lengths = traits_of(person)
+    return [f"{age:.0f}", *(f"{length:.1f}" for length in lengths)]
 
 
 def _slippage_section(data: dict[str, Any]) -> Section:
