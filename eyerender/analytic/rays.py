@@ -98,7 +98,7 @@ def glint_exits(
         rays = mirrored_rays(eye.front[0], lights_mm, place, rim_mm=eye.limbus_radius_mm)
         return rays.exit, rays.residual_mm, rays.status
     corneal = len(eye.front)
-    depth = {2: 2, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
+    depth = {2: corneal, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
     found = purkinje_points(
         (eye.front + eye.back)[:depth],
         (eye.front_indices + eye.back_indices)[:depth],

@@ -38,7 +38,7 @@ from .expressions import REFERENCE, evaluate, is_reference, names_of
 # Values that identify a subject, drawn once per subject unless the draw says otherwise.
 IDENTITY = (
     "eye.model", "eye.margin", "look", "region", "subject.ipd_mm", "subject.eyes", "subject.spectacles",
-    "eye_parameters",
+    "subject.contact_lens", "eye_parameters",
 )  # fmt: skip
 # Exceptions, which change with every frame.
 PASSING = ("region.blink",)

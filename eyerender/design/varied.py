@@ -138,11 +138,8 @@ def radius_of(surface: Surface) -> Floats:
     """
     if isinstance(surface, Biconic):
         return np.asarray(np.mean(surface.radii_mm, axis=-1))
-    if isinstance(surface, Quadric):
-        m, v = surface.matrix, surface.vector
-        conic = np.all(m[..., 1, 1] == 1.0) and np.all(m[..., 2, 2] == 1.0) and np.all(surface.constant == 0.0)
-        if conic and np.all(v[..., 0] > 0.0) and not np.any(v[..., 1:]):
-            return np.asarray(v[..., 0])
+    if isinstance(surface, Quadric) and (conic := surface.as_conic()) is not None:
+        return conic[0]
     raise InputError("the cornea is not a sphere, conic or biconic, so it has no radius to vary", path="cornea")
 
 

@@ -15,9 +15,10 @@ from ..optics.transforms import stacked
 from .model import EyeModel, LineOfSight, RotationCentres, Sphere, Stop
 from .worn import WornLens
 
-Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str, tuple[WornLens, ...]]
+Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str, tuple[WornLens, ...], bool]
+_SHARED = ("name", "side", "wavelength_nm", "back_passing", "worn", "has_contact_lens")
 _NUMBERS = tuple(
-    f.name for f in fields(EyeModel) if f.name not in ("name", "side", "wavelength_nm", "back_passing", "worn")
+    f.name for f in fields(EyeModel) if f.name not in _SHARED
 )
 _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
@@ -30,7 +31,7 @@ FEW_EYES = 4
 def structure_of(eye: EyeModel) -> Structure:
     """Return what eyes must share to be stacked: kinds and numbers of surfaces, and the lenses worn."""
     front, back = (tuple(s.kind for s in surfaces) for surfaces in (eye.front, eye.back))
-    return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind, eye.worn
+    return front, back, eye.back_passing, eye.lens_gradient is not None, eye.retina.kind, eye.worn, eye.has_contact_lens
 
 
 def stack_eyes(eyes: Sequence[EyeModel]) -> EyeModel:

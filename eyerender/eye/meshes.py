@@ -4,12 +4,13 @@ Vertices lie exactly on the surfaces of the model, normals are analytic, and fac
 patch between two transparent media has both indices; an opaque one has none. Bodies share the vertices of their
 patches, so they close without gaps:
 
+    contact_lens   front, rim, cornea's front          (where one is worn)
     cornea     front, rim, back                        (models with a posterior cornea)
     aqueous    cornea's back, chamber wall, hyaloid, lens
     lens       front, equator, back                    (a gradient lens: one body a shell, each inside the last)
     vitreous   hyaloid, lens' back, retinal wall
     interior   cornea's front, chamber wall, retinal wall      (models of one medium)
-    globe      cornea's front, sclera
+    globe      the outermost front, sclera
 
 Where a model leaves a gap, it is closed as follows: the posterior cornea ends where it meets the plane of the iris or
 at the limbus; a lens without a rim of its own ends at 4.5 mm or where its surfaces meet; the retinal wall is a sphere 1
@@ -19,6 +20,7 @@ mm inside the sclera. The renderer itself intersects the surfaces in closed form
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -70,17 +72,14 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
     eye = eye.shelled()
     angle = 2 * np.pi * np.arange(sectors) / sectors
     cornea = cornea_patches(eye, rings, sectors)
-    front = cornea[0]
-    patches = {"cornea_front": front}
+    front, innermost = cornea[0], cornea[-1]
+    patches = {patch.name: patch for patch in cornea}
     bodies: dict[str, Any] = {}
-    rim = _rim(front, sectors)
-
-    inner_rim = rim
-    if len(eye.front) > 1:
-        back = cornea[-1]
-        inner_rim = _rim(back, sectors)
-        patches |= {"cornea_back": back, "cornea_rim": _band("cornea_rim", rim, inner_rim)}
-        bodies["cornea"] = _closed((front, 1), (patches["cornea_rim"], 1), (back, -1))
+    rim, inner_rim = _rim(front, sectors), _rim(innermost, sectors)
+    for outer, inner in pairwise(cornea):
+        body = outer.name.removesuffix("_front")
+        edge = _band(f"{body}_rim", _rim(outer, sectors), _rim(inner, sectors))
+        patches[edge.name], bodies[body] = edge, _closed((outer, 1), (edge, 1), (inner, -1))
     aqueous = float(eye.front_indices[-1])
 
     lenses = _lenses(eye, aqueous, rings, sectors, angle)
@@ -96,7 +95,6 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
         lens_front, lens_side, lens_back = lenses[0]
         hyaloid = _band("hyaloid", equator, wall_ring, aqueous, behind)
         patches["hyaloid"] = hyaloid
-        innermost = patches.get("cornea_back", front)
         bodies["aqueous"] = _closed(
             (innermost, 1), (chamber, 1), (hyaloid, -1), (lens_front, -1), (lens_side, -1)
         )  # fmt: skip
@@ -112,14 +110,19 @@ def eye_meshes(eye: EyeModel, rings: int = 48, sectors: int = 128) -> EyeMeshes:
 
 
 def cornea_patches(eye: EyeModel, rings: int, sectors: int) -> tuple[Patch, ...]:
-    """Compute the patches of the cornea's refracting surfaces, outside in: the front, and the back if there is one."""
-    limbus = np.full(sectors, float(eye.limbus_radius_mm))
+    """Compute the patches of the refracting surfaces before the stop, outside in.
+
+    They are the front of a contact lens if one is worn, the cornea's front, and its back if it has one.
+    """
+    names = [*(["contact_lens_front"] if eye.has_contact_lens else []), "cornea_front", "cornea_back"]
     indices = [1.0, *(float(n) for n in eye.front_indices)]
-    patches = [_cap("cornea_front", eye.front[0], limbus, rings, indices[0], indices[1])]
-    if len(eye.front) > 1:
-        stop, angle = eye.stop, 2 * np.pi * np.arange(sectors) / sectors
-        rho = chamber_rim(eye.front[-1], stop.centre_mm, stop.normal, float(eye.limbus_radius_mm), angle)
-        patches.append(_cap("cornea_back", eye.front[-1], rho, rings, indices[1], indices[2]))
+    patches = []
+    for k, (name, surface) in enumerate(zip(names, eye.front, strict=False)):
+        rho = np.full(sectors, float(eye.limbus_radius_mm))
+        if name == "cornea_back":
+            angle = 2 * np.pi * np.arange(sectors) / sectors
+            rho = chamber_rim(surface, eye.stop.centre_mm, eye.stop.normal, float(eye.limbus_radius_mm), angle)
+        patches.append(_cap(name, surface, rho, rings, indices[k], indices[k + 1]))
     return tuple(patches)
 
 

@@ -175,6 +175,7 @@ class EyeModel(ArrayValue):
         chief_ray: the fixed ray in air that reaches the fovea through the stop's centre.
         lens_gradient: medium of a gradient lens; None without one, or if it is made of shells.
         worn: spectacle lenses in front of the eye, in order from it, in the frame of the unrotated eye.
+        has_contact_lens: whether the first surface is the front of a contact lens, and the next one the cornea's.
     """
 
     name: str
@@ -196,12 +197,13 @@ class EyeModel(ArrayValue):
     chief_ray: LineOfSight
     lens_gradient: GradientMedium | None = None
     worn: tuple[WornLens, ...] = ()
+    has_contact_lens: bool = False
 
     @property
     def purkinje_orders(self) -> tuple[int, ...]:
-        """Purkinje images that this eye has: 1 front cornea, 2 back cornea, 3 lens front, 4 lens back."""
+        """Purkinje images that this eye has: 1 front (of the cornea or what it wears), 2 back cornea, 3 and 4 lens."""
         orders = [1]
-        if len(self.front) > 1:
+        if len(self.front) - self.has_contact_lens > 1:
             orders.append(2)
         if len(self.back) > 1:
             orders += [3, 4]

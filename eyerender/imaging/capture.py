@@ -246,14 +246,18 @@ def focus_dpt(frames: RenderableFrames, row: int) -> float:
     """Compute the vergence (D) at which the eye of one row is focused.
 
     If the scene states the accommodation, as for drawn people, the eye is focused that much nearer than its far point.
-    Otherwise it is focused on its target, or far away without one, unless it is too short-sighted.
+    Otherwise it is focused on its target, or far away without one, unless it is too short-sighted. A contact lens moves
+    the far point.
     """
     scene, index = frames.scene, frames.index
-    far = -at_cornea_d(scene.refraction_d(EYES[index.eye[row]]))
+    side = EYES[index.eye[row]]
+    far = -at_cornea_d(scene.refraction_d(side))
+    if (contact := scene.contact_lens(side)) is not None:
+        far += contact.power_d
     if (accommodation := scene.accommodation_d) is not None:
         return far + accommodation
     gap = index.target_mm[row] - (index.eye_position_mm[row] + index.head_mm[row])
-    eye = scene.eye(EYES[index.eye[row]], tuple(index.head_mm[row]))
+    eye = scene.eye(side, tuple(index.head_mm[row]))
     if eye.worn and np.isfinite(gap).all():
         gap = apparent_places(eye.worn, gap[None])[0]
     target = 1e3 / float(np.linalg.norm(gap)) if np.isfinite(gap).all() else 0.0

@@ -41,7 +41,7 @@ def image_line(
     """
     tree = scene.spec.to_mapping() if tree is None else tree
     eye = scene.eye_file(record["eye"]).to_mapping() if eye is None else eye
-    spec = scene.spec
+    spec, contact = scene.spec, scene.contact_lens(record["eye"])
     return {
         "schema": IMAGE_SCHEMA,
         **dict.fromkeys(FILE_KEYS),
@@ -64,7 +64,7 @@ def image_line(
             **dict.fromkeys(DRAWN_KEYS),
             **(drawn or {}),
             "spectacles": _worn(scene, record["eye"]),
-            "contact_lens": None,
+            "contact_lens": None if contact is None else json.dumps(contact.to_mapping(), sort_keys=True),
             **scene.person_numbers(record["eye"]),
             # Stored as text, because their nested keys may differ between images, which table columns do not allow.
             "scene_json": json.dumps(tree, sort_keys=True),

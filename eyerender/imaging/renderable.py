@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol, Self, runtime_checkable
 
 from ..analytic.observer import Traceable, TraceableScene
+from ..eye.contact import ContactLens
 from ..eye.model import EyeModel
 from ..region.anatomy import Region
 from ..region.look import Look
@@ -95,6 +96,10 @@ class RenderableScene(TraceableScene, Protocol):
 
     def eye(self, side: str, head_mm: tuple[float, ...] | None = None) -> EyeModel:
         """Return the numeric eye of a side, with the lenses worn at a position of the head."""
+        ...
+
+    def contact_lens(self, side: str) -> ContactLens | None:
+        """Return the contact lens on an eye."""
         ...
 
     def refraction_d(self, side: str) -> float:

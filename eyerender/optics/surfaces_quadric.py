@@ -136,6 +136,14 @@ class Quadric(Surface):
         sign = 1.0 if front else -1.0
         return cls.oriented(matrix, np.array([g, h, i]) / scale, np.array(k / scale), sign, origin_mm, rotation)
 
+    def as_conic(self) -> tuple[Floats, Floats] | None:
+        """Return radius (...,) mm and conic constant (...,) of a conic with its apex at the origin, R > 0; else None."""
+        m, v = self.matrix, self.vector
+        square = m * (1.0 - np.eye(3))
+        conic = np.all(m[..., 1, 1] == 1.0) and np.all(m[..., 2, 2] == 1.0) and not np.any(square)
+        conic = conic and not np.any(self.constant) and not np.any(v[..., 1:]) and np.all(v[..., 0] > 0.0)
+        return (np.asarray(v[..., 0]), np.asarray(m[..., 0, 0] - 1.0)) if conic else None
+
     @property
     def coefficients(self) -> tuple[Floats | float, ...]:
         """Return (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame; numbers or (n,) arrays."""

@@ -29,6 +29,7 @@ from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
+from ..eye.contact import ContactLens, contact_lens_of
 from ..eye.spectacles import SpectacleLens, demand_through_d, lenses_of
 from ..population.eyes import amplitude_d
 from ..population.people import Person
@@ -507,10 +508,16 @@ class Scene:
         if self.spec.person is None and (state := _state_of(self.spec, self.rig)) is not None:
             same = _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
         built = _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
-        lenses = lenses_of(self.spec.subject.spectacles, side)
+        contact, lenses = self.contact_lens(side), lenses_of(self.spec.subject.spectacles, side)
         on_rig = any(lens.mount == "rig" for lens in lenses)
         head = self.spec.subject.head_positions_mm[0] if head_mm is None else head_mm
-        return _wearing(_Same(built), lenses, tuple(head) if on_rig else None) if lenses else built
+        if contact is None and not lenses:
+            return built
+        return _wearing(_Same(built), contact, lenses, tuple(head) if on_rig else None)
+
+    def contact_lens(self, side: str) -> ContactLens | None:
+        """Return the contact lens on one eye."""
+        return contact_lens_of(self.spec.subject.contact_lens, side)
 
     def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
         """Build the numeric eyes of an index, and return which of them each row uses; only observed eyes are built."""
@@ -729,7 +736,7 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
     """Compute the accommodation (D) of a scene's eyes: as given, or what its targets demand.
 
     The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position, or
-    what glasses make of it at the cornea, on average over the eyes. The mean refractive error of a drawn person's eyes
+    what glasses and contact lenses make of it at the cornea, on average over the eyes. The mean refractive error of a drawn person's eyes
     is added: hyperopes accommodate more, myopes less, and nobody less than 0.
     """
     given = spec.subject.accommodation_d
@@ -742,6 +749,8 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
     if spec.subject.spectacles is not None:
         worn = [lenses_of(spec.subject.spectacles, side) for side in spec.subject.eyes]
         vergence = float(np.mean([demand_through_d(lenses, distance) for lenses in worn]))
+    on = [contact_lens_of(spec.subject.contact_lens, side) for side in spec.subject.eyes]
+    vergence -= float(np.mean([0.0 if lens is None else lens.power_d for lens in on]))
     if spec.person is not None:
         vergence += spec.person.mean_refraction_d
     return max(vergence, 0.0)
@@ -877,7 +886,17 @@ def _built_eye(
 
 
 @lru_cache(maxsize=64)
-def _wearing(eye: _Same[EyeModel], lenses: tuple[SpectacleLens, ...], head_mm: tuple[float, ...] | None) -> EyeModel:
-    """Put lenses in front of a numeric eye; cached, because observers compare eyes by identity."""
+def _wearing(
+    eye: _Same[EyeModel],
+    contact: ContactLens | None,
+    lenses: tuple[SpectacleLens, ...],
+    head_mm: tuple[float, ...] | None,
+) -> EyeModel:
+    """Put lenses on and before a numeric eye; cached, because observers compare eyes by identity."""
     bare, head = eye.spec, None if head_mm is None else np.array(head_mm)
+    if contact is not None:
+        try:
+            bare = contact.worn_by(bare)
+        except InputError as error:
+            raise error.placed(under="subject.contact_lens") from None
     return replace(bare, worn=tuple(lens.build(bare.side, bare.wavelength_nm, head) for lens in lenses))

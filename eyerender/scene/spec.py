@@ -16,6 +16,7 @@ from ..eye.catalogue import load_eye, refuse_unknown
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.spec import EyeSpec
+from ..eye.contact import ContactLenses
 from ..eye.spectacles import Spectacles, lenses_of
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
@@ -145,6 +146,9 @@ class SubjectSpec(Spec):
         description="a lens in front of both eyes, a list of lenses in order from the eye, or `{right: .., left: ..}` "
         "of these; default: none",
     )
+    contact_lens: ContactLenses | None = Field(
+        default=None, description="a soft contact lens on both eyes, or `{right: .., left: ..}`; default: none"
+    )
 
 
 class Targets(Spec):
@@ -270,8 +274,9 @@ class SceneSpec(FileSpec):
 
     def _check_response(self) -> None:
         subject = self.subject
-        if subject.spectacles is not None and self.eye.line_of_sight != "chief_ray":
-            raise KeyProblem("eye.line_of_sight", "must be chief_ray with subject.spectacles")
+        for name in ("spectacles", "contact_lens"):
+            if getattr(subject, name) is not None and self.eye.line_of_sight != "chief_ray":
+                raise KeyProblem("eye.line_of_sight", f"must be chief_ray with subject.{name}")
         framed = any(lens.frame for side in EYES for lens in lenses_of(subject.spectacles, side))
         if framed and (self.region is None or self.region.head is not None):
             raise KeyProblem("subject.spectacles", "frames are drawn around eyes with a region and without a head mesh")

@@ -103,7 +103,7 @@ def stack(
     if order not in eye.purkinje_orders or order == 1:
         raise InputError(f"{eye.name} has no Purkinje image {order}", path="purkinje")
     corneal = len(eye.front)
-    depth = {2: 2, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
+    depth = {2: corneal, 3: corneal + 1, 4: corneal + len(eye.back)}[order]
     rims = (float(eye.limbus_radius_mm), *(np.inf for _ in eye.front[1:]), *(float(r) for r in eye.back_rims_mm))
     indices = tuple(float(n) for n in (*eye.front_indices, *eye.back_indices))
     passing = ((False,) * corneal + eye.back_passing)[:depth]

@@ -68,6 +68,7 @@ def export_scene(
         "iris": look.iris_albedo,
         "sclera": look.sclera_albedo,
         "retina": look.pupil_albedo,
+        "contact_lens_rim": look.limbus_albedo,
         "cornea_rim": look.limbus_albedo,
         "chamber_wall": look.limbus_albedo,
         "iris_root": look.limbus_albedo,
@@ -77,7 +78,8 @@ def export_scene(
     patches = eye_meshes(job.eye, rings, sectors).patches
     more = [_root(job.eye, patches["chamber_wall"], sectors)]
     if look.tear_film:
-        film, patches["cornea_front"], rim = _film(patches["cornea_front"], job.film_index, sectors)
+        outer = next(iter(patches))
+        film, patches[outer], rim = _film(patches[outer], job.film_index, sectors)
         more += [film, rim]
     for patch in (*patches.values(), *more):
         _patch(root, folder, patch, motion, albedo.get(patch.name, 0.0))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from eyerender.base.arrays import frozen
+from eyerender.eye.contact import ContactLens
 from eyerender.rig.camera import Camera
 from eyerender.rig.light import Lamp
 from tests.support.render_oracles import cos4, stock
@@ -44,9 +45,9 @@ def test_sclera_and_surround_against_path(renderer, tmp_path, depth, tolerance):
 
 
 @pytest.mark.slow
-def test_iris_under_large_lamps_against_path(renderer, tmp_path):
+@pytest.mark.parametrize("eye", [eye_of("E2"), ContactLens(power_d=-6.0).worn_by(eye_of("E4"))], ids=["bare", "lens"])
+def test_iris_under_large_lamps_against_path(renderer, tmp_path, eye):
     # The path tracer finds a lamp behind a cornea only by chance; two lamps of 100 mm at 300 mm make that bearable.
-    eye = eye_of("E2")
     n = 48
     camera = Camera(
         resolution_px=(n, n), position_mm=(600.0, 0.0, 0.0), look_at_mm=(0.0, 0.0, 0.0), focal_length_px=600 * n / 11.4
