@@ -17,9 +17,7 @@ from .worn import WornLens
 
 Structure = tuple[tuple[str, ...], tuple[str, ...], tuple[bool, ...], bool, str, tuple[WornLens, ...], bool]
 _SHARED = ("name", "side", "wavelength_nm", "back_passing", "worn", "has_contact_lens")
-_NUMBERS = tuple(
-    f.name for f in fields(EyeModel) if f.name not in _SHARED
-)
+_NUMBERS = tuple(f.name for f in fields(EyeModel) if f.name not in _SHARED)
 _RECORDS = (LineOfSight, RotationCentres, Sphere, Stop)
 
 CHUNK_POINTS = 30000

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import Floats, frozen
 from ..base.errors import InputError
-from ..base.spec import EYES, Spec, Vec2
+from ..base.spec import EYES, KeyProblem, Spec, Vec2
 from ..optics.surfaces import Surface
 from ..optics.surfaces_biconic import Biconic
 from ..optics.surfaces_measured import Measured, ZernikeSurface
@@ -26,6 +26,7 @@ from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import rotation_y, rotation_z
 from .landmarks import chief_ray_in_air
 from .model import EyeModel
+from .spectacles import OWN, OWN_MISSING
 
 CENTRE_MM, EDGE_MM = 0.08, 0.03
 """Smallest thickness at the centre and over the limbus (chosen)."""
@@ -48,6 +49,13 @@ class ContactLens(Spec):
         default=14.2, description="diameter; the lens must cover the cornea, and beyond it nothing is drawn"
     )
     decentration_mm: Vec2 = Field(default=(0.0, 0.0), description="displacement on the eye, nasal and up")
+    prescription: Literal["own"] | None = Field(default=None, description=OWN)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.prescription is not None:
+            raise KeyProblem("prescription", OWN_MISSING)
+        return self
 
     def bend(self, thickness_mm: float) -> float:
         """Compute the curvature of the front as made less that of the back, 1/mm."""
@@ -107,7 +115,7 @@ def _bent(surface: Surface, bend: float, origin_mm: Floats, rotation: Floats) ->
     if isinstance(surface, Measured):
         outer = np.concatenate([_raised(surface.outer[:2], bend), surface.outer[2:]])
         if isinstance(surface, ZernikeSurface):
-            base = surface.base + [bend, 0.0]
+            base = surface.base + np.array([bend, 0.0])
             return replace(surface, outer=outer, base=base, origin_mm=origin_mm, rotation=rotation)
         return replace(surface, outer=outer, origin_mm=origin_mm, rotation=rotation)  # type: ignore[type-var]
     raise InputError("needs a cornea that is a sphere, conic, biconic or measured")

@@ -108,6 +108,9 @@ class _Solved(NamedTuple):
     thickness_mm: float
 
 
+OWN = "`own`: the prescription of the drawn person, for each eye, in scenes with a `population`"
+OWN_MISSING = "needs a drawn person: `population`, or person.spectacles() and person.contact_lens() in Python"
+
 _PRESCRIBED = ("sphere_d", "cylinder_d", "axis_deg", "material", "index", "base_curve_d", "thickness_mm")
 
 
@@ -159,6 +162,7 @@ class SpectacleLens(Spec):
     transmission: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0, description="of the material, along any path"
     )
+    prescription: Literal["own"] | None = Field(default=None, description=OWN)
     frame: SpectacleFrame | None = Field(
         default=None,
         description="what holds the lens, in pictures with a region; default: as `{}`, and none at index 1",
@@ -166,6 +170,8 @@ class SpectacleLens(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.prescription is not None:
+            raise KeyProblem("prescription", OWN_MISSING)
         if self.surfaces is not None:
             for name in _PRESCRIBED:
                 if getattr(self, name) != type(self).model_fields[name].default:

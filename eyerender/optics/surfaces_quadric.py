@@ -137,7 +137,7 @@ class Quadric(Surface):
         return cls.oriented(matrix, np.array([g, h, i]) / scale, np.array(k / scale), sign, origin_mm, rotation)
 
     def as_conic(self) -> tuple[Floats, Floats] | None:
-        """Return radius (...,) mm and conic constant (...,) of a conic with its apex at the origin, R > 0; else None."""
+        """Return radius and conic constant (...,) of a conic with its apex at the origin and R > 0; None for others."""
         m, v = self.matrix, self.vector
         square = m * (1.0 - np.eye(3))
         conic = np.all(m[..., 1, 1] == 1.0) and np.all(m[..., 2, 2] == 1.0) and not np.any(square)

@@ -20,6 +20,7 @@ from ..eye.refraction import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..region.anatomy import Region
 from ..region.look import Look
+from . import correction
 from .draw import Conditions, latent_numbers
 from .eyes import amplitude_d, eye_file
 from .marginals import Fixed
@@ -42,6 +43,12 @@ class PopulationSpec(Spec):
     where: dict[str, Number | tuple[Number, Number]] = Field(
         default_factory=dict,
         description="quantity -> its value, or the range in which it must lie (of an eye's quantity: of both eyes)",
+    )
+
+    corrected: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.0,
+        description="share of those who need a correction that wear their own glasses or contact lenses in scenes; the "
+        "people stay the same",
     )
 
     @model_validator(mode="after")
@@ -229,6 +236,18 @@ class Person(Spec):
             passed = mine.get("limbus_transmittance", Look.model_fields["limbus_transmittance"].default)
             mine["limbus_albedo"] = min(mine["limbus_albedo"], 1 - passed)
         return Look.from_mapping({"iris_seed": self.draw_seed("iris"), **mine})
+
+    def spectacles(self, **keys: Any) -> dict[str, Any]:
+        """Return `spectacles` of a subject with the prescriptions of both eyes; `keys` are those of the lenses."""
+        return correction.spectacles_of(self, **keys)
+
+    def contact_lens(self, **keys: Any) -> dict[str, Any]:
+        """Return `contact_lens` of a subject with the powers of both eyes; `keys` are those of the lenses."""
+        return correction.contact_lens_of_person(self, **keys)
+
+    def worn(self, share: float) -> dict[str, Any]:
+        """Return `spectacles` or `contact_lens` of a subject, or neither, if a share of those in need wears one."""
+        return correction.worn_by(self, share)
 
     def _under(self, prefix: str) -> dict[str, float]:
         return {name[len(prefix) :]: self.number(name) for name in self.numbers if name.startswith(prefix)}

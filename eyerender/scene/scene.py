@@ -24,12 +24,12 @@ from ..base.arrays import ArrayValue, Bools, Floats, Indices
 from ..base.errors import InputError, InputWarning
 from ..base.spec import Side, Spec, file_digest
 from ..base.status import Status
+from ..eye.contact import ContactLens, contact_lens_of
 from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
-from ..eye.contact import ContactLens, contact_lens_of
 from ..eye.spectacles import SpectacleLens, demand_through_d, lenses_of
 from ..population.eyes import amplitude_d
 from ..population.people import Person
@@ -736,8 +736,8 @@ def demand_d(spec: SceneSpec, targets_mm: Floats | None) -> float:
     """Compute the accommodation (D) of a scene's eyes: as given, or what its targets demand.
 
     The vergence of a target is 1 / its distance from the point midway between the eyes, at the first head position, or
-    what glasses and contact lenses make of it at the cornea, on average over the eyes. The mean refractive error of a drawn person's eyes
-    is added: hyperopes accommodate more, myopes less, and nobody less than 0.
+    what glasses and contact lenses make of it at the cornea, on average over the eyes. The mean refractive error of a
+    drawn person's eyes is added: hyperopes accommodate more, myopes less, and nobody less than 0.
     """
     given = spec.subject.accommodation_d
     if given is not None and given != "targets":

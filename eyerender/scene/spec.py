@@ -13,10 +13,10 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from ..base.errors import InputError
 from ..base.spec import EYES, FileSpec, KeyProblem, Positive, Side, Spec, Vec2, Vec3
 from ..eye.catalogue import load_eye, refuse_unknown
+from ..eye.contact import ContactLenses
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel
 from ..eye.spec import EyeSpec
-from ..eye.contact import ContactLenses
 from ..eye.spectacles import Spectacles, lenses_of
 from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
@@ -365,7 +365,11 @@ def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
         person = chosen_person(given.to_mapping() if isinstance(given, Spec) else given)
     except InputError as error:
         raise error.placed(under="population") from None
-    return with_person({key: value for key, value in data.items() if key != "population"}, person)
+    out = with_person({key: value for key, value in data.items() if key != "population"}, person)
+    share = given.corrected if isinstance(given, PersonChoice) else float(given.get("corrected", 0.0))
+    if share and not {"spectacles", "contact_lens"} & out["subject"].keys():
+        out["subject"] = {**out["subject"], **person.worn(share)}
+    return out
 
 
 def with_person(data: Mapping[str, Any], person: Person) -> dict[str, Any]:
@@ -374,12 +378,22 @@ def with_person(data: Mapping[str, Any], person: Person) -> dict[str, Any]:
     subject = subject.to_mapping() if isinstance(subject, Spec) else subject
     if "ipd_mm" not in subject:
         subject = {"ipd_mm": _apex_distance_mm(person), **subject}
-    out = {**data, "person": person.to_mapping(), "subject": subject}
+    out = {**data, "person": person.to_mapping(), "subject": _with_own_lenses(subject, person)}
     for key, own in (("look", person.look()), ("region", person.region())):
         given = data.get(key, {})
         given = given.to_mapping() if isinstance(given, Spec) else given
         if isinstance(given, Mapping) and not (key == "region" and given.get("head") is not None):
             out[key] = _merged(own.to_mapping(), given)
+    return out
+
+
+def _with_own_lenses(subject: Mapping[str, Any], person: Person) -> dict[str, Any]:
+    """Write lenses of the person's own prescription out for each eye."""
+    out = dict(subject)
+    for key, write in (("spectacles", person.spectacles), ("contact_lens", person.contact_lens)):
+        given = out.get(key)
+        if isinstance(given, Mapping) and given.get("prescription") == "own":
+            out[key] = write(**{name: value for name, value in given.items() if name != "prescription"})
     return out
 
 
