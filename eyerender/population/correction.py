@@ -85,7 +85,8 @@ def worn_by(person: Person, share: float) -> dict[str, Any]:
     largest = max(abs(e["sphere_d"] + e["cylinder_d"] / 2.0) for e in errors)
     if wears >= share or (largest < NEEDED_D and max(-e["cylinder_d"] for e in errors) < NEEDED_CYLINDER_D):
         return {}
-    if contact < np.interp(person.number("age_years"), _CONTACT_AGES, _CONTACT_SHARES) and largest < MOST_CONTACT_D:
+    likes_contact = contact < np.interp(person.number("age_years"), _CONTACT_AGES, _CONTACT_SHARES)
+    if likes_contact and NEEDED_D <= largest < MOST_CONTACT_D:
         return {"contact_lens": contact_lens_of_person(person)}
     lens: dict[str, Any] = {"vertex_mm": vertex, "pantoscopic_deg": tilt, "wrap_deg": wrap}
     lens["material"] = "CR-39" if largest < 3.0 else "1.60" if largest < 6.0 else "1.67"
