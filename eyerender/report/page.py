@@ -7,9 +7,10 @@ package.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -106,6 +107,32 @@ def degrees_text(value: float | None) -> str:
 def number(value: float | None, decimals: int = 4) -> str:
     """Format a number of a table; a dash for None and for what is not finite."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
+
+
+def table_of(
+    items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], Any]], caption: str = "", **options: Any
+) -> Table:
+    """Make a table of records; each column has the name of a key, or a function of the record.
+
+    Columns without any value are left out. `options` are fields of `Table`; `wide` counts the columns as given.
+    """
+    rows = [[source(one) if callable(source) else _value(one, source) for source in columns.values()] for one in items]
+    kept = [k for k in range(len(columns)) if not rows or any(row[k] not in (None, "") for row in rows)]
+    header = list(columns)
+    wide = tuple(kept.index(k) for k in options.pop("wide", ()) if k in kept)
+    cells = [[cell(row[k]) for k in kept] for row in rows]
+    return Table([header[k] for k in kept], cells, caption, wide=wide, **options)
+
+
+def _value(item: Any, key: str) -> Any:
+    return item[key] if isinstance(item, Mapping) else getattr(item, key)
+
+
+def cell(value: Any) -> str:
+    """Format a value of a table: numbers with four decimals, truths as yes or no, a dash for None."""
+    if value is None or isinstance(value, bool):
+        return "-" if value is None else "yes" if value else "no"
+    return number(value) if isinstance(value, float) else str(value)
 
 
 def write_page(path: Path, page: Page) -> None:

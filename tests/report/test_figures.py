@@ -191,18 +191,18 @@ def case_lines(kept):
 
 
 def case_waterfall(kept):
-    study.waterfall_figure(["a", "b", "c"], {"mean": {"E1": [1.5, None, 0.5], "E3": [2, 1, 0.25]}})
+    study.rows_figure(["a", "b", "c"], {"mean": {"E1": [1.5, None, 0.5], "E3": [2, 1, 0.25]}}, "x", joined=True)
     assert_shown(kept[0].axes[0], [1.5, NAN, 0.5], [0, 1, 2])
     assert_shown(kept[0].axes[0], [2, 1, 0.25], [0, 1, 2])
 
 
 def case_sensitivity(kept):
-    study.sensitivity_figure(["a", "b"], {"one": {"E1": [0.1, -0.2]}}, "x")
+    study.rows_figure(["a", "b"], {"one": {"E1": [0.1, -0.2]}}, "x")
     assert_shown(kept[0].axes[0], [0.1, -0.2], [0, 1])
 
 
 def case_sets(kept):
-    study.sets_figure(["3", "9"], {"image": {"E4": [0.6, 0.3]}}, [0.9, 0.5])
+    study.lines_figure({"image": {"E4": [0.6, 0.3]}}, [0, 1], "x", "y", ["3", "9"], [0.9, 0.5])
     assert_shown(kept[0].axes[0], [0, 1], [0.6, 0.3])
     assert_shown(kept[0].axes[0], [0, 1], [0.9, 0.5])
 

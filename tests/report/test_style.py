@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.apps.study.figures import lines_figure, map_figure, sensitivity_figure, waterfall_figure
+from eyerender.apps.study.figures import lines_figure, map_figure, rows_figure
 from eyerender.report.style import figure, svg
 
 NAN = float("nan")
@@ -56,8 +56,11 @@ def test_figure_without_any_value_says_so():
     ("draw", "panels"),
     [
         (lambda p: lines_figure(p, [1.0, 2.0], "x", "y"), {"one": {"E1": [NAN, NAN]}, "two": {"E1": [1.0, 2.0]}}),
-        (lambda p: waterfall_figure(["a", "b"], p), {"one": {"E1": [None, None]}, "two": {"E1": [1.0, None]}}),
-        (lambda p: sensitivity_figure(["a", "b"], p, "x"), {"one": {"E1": [NAN, NAN]}, "two": {"E1": [1.0, 2.0]}}),
+        (
+            lambda p: rows_figure(["a", "b"], p, "x", joined=True),
+            {"one": {"E1": [None, None]}, "two": {"E1": [1.0, None]}},
+        ),
+        (lambda p: rows_figure(["a", "b"], p, "x"), {"one": {"E1": [NAN, NAN]}, "two": {"E1": [1.0, 2.0]}}),
         (
             lambda p: map_figure(p, np.arange(2.0), np.arange(2.0), "x", "y", "deg"),
             {"one": np.full((2, 2), NAN), "two": np.eye(2)},

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
-from eyerender.apps.study import blignaut, guestrin
+from eyerender.apps.study import guestrin
+from eyerender.apps.study.blignaut_study import BlignautStudy
+from eyerender.apps.study.guestrin_study import GuestrinStudy
 from eyerender.apps.study.images import (
     dataset_spec,
     in_sequence,
@@ -23,8 +25,8 @@ from eyerender.apps.study.images import (
 )
 from eyerender.apps.study.observing import Observing
 from eyerender.apps.study.options import StudyOptions
-from eyerender.apps.study.replicate import facing, scenes_of
 from eyerender.apps.study.run import run_study
+from eyerender.apps.study.study import StudyJob
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.validate import validate
 from eyerender.folders.imagefile import read_image
@@ -34,18 +36,18 @@ from tests.support.paths import ROOT
 from tests.support.study_scenes import small_scenes
 
 
-@pytest.mark.parametrize("module", [guestrin, blignaut])
-def test_the_dataset_says_exactly_what_the_study_observes(module):
+@pytest.mark.parametrize("study", [GuestrinStudy(), BlignautStudy()])
+def test_the_dataset_says_exactly_what_the_study_observes(study):
     """Every sample of the plan is one of the study's own noisy shots: scene, eye file, seed and all; the
     others are the same without noise, and exposed beside them."""
-    scenes = scenes_of(module, ("E1", "E5"), ("published", "corrected"))
+    scenes = [study.scenes(StudyJob(who=eye), p)[""] for eye in ("E1", "E5") for p in ("published", "corrected")]
 
     def wanted_by(*kinds):
         return [
             shot.scene
             for scene in scenes
             for kind in kinds
-            for shot in Observing(kind).shots(scene, facing=facing(module), spp=4)
+            for shot in Observing(kind).shots(scene, facing=study.facing, spp=4)
         ]
 
     wanted, quiet = wanted_by("image"), wanted_by("image-noiseless")
@@ -53,7 +55,7 @@ def test_the_dataset_says_exactly_what_the_study_observes(module):
     plan = Plan.of(spec)
     assert spec.labels.noiseless
     assert [s.spec for s in quiet] == [without_noise(s).spec for s in wanted]
-    assert spec.count == len(wanted) == 2 * 2 * (15 if module is guestrin else 4) / 2
+    assert spec.count == len(wanted) == 2 * 2 * (15 if study.facing else 4) / 2
     half = len(wanted) // 2
     for subject in range(2):  # an eye model, which enters the sequence of its scenes anywhere
         drawn = [plan.draw(subject * half + k) for k in range(half)]
@@ -69,7 +71,7 @@ def test_the_dataset_says_exactly_what_the_study_observes(module):
         spec = dataset_spec("study", alone)
         assert (spec.count, spec.labels.noiseless) == (len(alone), False)
         assert Plan.of(spec).draw(0).scene in [scene.spec.to_mapping() for scene in alone[: len(alone) // 2]]
-    assert {len(w.frames()) for w in wanted} == {9 if module is guestrin else 135}
+    assert {len(w.frames()) for w in wanted} == {9 if study.facing else 135}
 
 
 def test_shots_cover_every_observation_once():

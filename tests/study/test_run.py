@@ -12,13 +12,15 @@ import pytest
 
 from eyerender.analytic.observer import trace
 from eyerender.apps.study import guestrin, head_mounted, observers_compared
-from eyerender.apps.study.conditions import FIXED, PARAMETERS, SHIFTED, TRACKERS, conditions_part, people_part
+from eyerender.apps.study.conditions import FIXED, PARAMETERS, SHIFTED, TRACKERS, conditions_part, person_part
 from eyerender.apps.study.images import StudyImages, facing_scene
 from eyerender.apps.study.observing import Observing, moved, with_index_of
 from eyerender.apps.study.run import run_study
 from eyerender.base.errors import InputError
 from eyerender.base.status import Status
 from eyerender.cli.main import run
+from eyerender.gaze.regression import Regression
+from eyerender.gaze.validation import gaze_errors
 from eyerender.scene import load_scene
 
 
@@ -61,7 +63,7 @@ def test_the_optimiser_is_in_the_result(folders):
     }  # fmt: skip
     assert settings["random_starts"]["count"] == 20
     assert all(c["restarts"]["count"] == 20 for c in summary["calibrations"])
-    assert len(summary["t_tests"]) == 2 * 2
+    assert len(summary["t_tests"]) == 2 * 3  # H1, H2 and the rise
 
 
 @pytest.mark.parametrize("name", ["guestrin2006", "blignaut2014"])
@@ -108,6 +110,51 @@ def test_protocol_and_eye_are_chosen_on_the_command_line(tmp_path, capsys):
     assert re.search(r"corrected\s+analytic\s+E2\s+C135\s+R8\s+0\.03", capsys.readouterr().out)
 
 
+OWN = """
+import eyerender as er
+
+
+class Own(er.apps.Study):
+    title = "Wide pupils"
+    scene_name = "blignaut2014"
+    conditions = {"4 mm": {"targets": {"grid": [3, 3]}},
+                  "8 mm": {"targets": {"grid": [3, 3]}, "eye": {"pupil_diameter_mm": 8.0}}}
+    estimators = {"R1": er.gaze.Regression("R1"), "R3": er.gaze.Regression("R3")}
+
+    def findings(self, parts):
+        means = {row.variant: row.mean_deg for row in parts[0].rows}
+        rise = means["R3, 8 mm"] - means["R3, 4 mm"]
+        return [er.apps.Finding.of("S1", ("own", "analytic"), "a wide pupil errs more: rise (deg)", rise, "> 0")]
+
+
+class Broken(Own):
+    def findings(self, parts):
+        return [er.apps.Finding.of("S1", ("own", "analytic"), "anything", 1.0, "about 1")]
+"""
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_study_of_ones_own(tmp_path, monkeypatch, capsys):
+    """Each error is that of the estimator called by hand, in the condition it was calibrated in and in the other."""
+    (tmp_path / "own.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    assert run(["study", "own:Own", "-o", "out", "--eyes", "E2", "--people", "1", "--json", "-"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    rows = {(r["eye_model"], r["variant"]): r["mean_deg"] for r in summary["rows"]}
+    assert set(rows) == {(who, f"{f}, {mm} mm") for who in ("E2", "adults 0/0") for f in ("R1", "R3") for mm in (4, 8)}
+    scenes = [load_scene("blignaut2014", eye="E2").with_({"targets.grid": [3, 3], "eye.pupil_diameter_mm": mm})
+              for mm in (4.0, 8.0)]  # fmt: skip
+    seen = [trace(scene) for scene in scenes]
+    fitted = Regression("R3").fit(seen[0], scenes[0].rig)
+    for mm, one in zip((4, 8), seen, strict=True):
+        expected = gaze_errors(one, fitted.predict(one, scenes[0].rig)).mean_deg
+        assert rows["E2", f"R3, {mm} mm"] == pytest.approx(expected, rel=1e-12)
+    assert rows["adults 0/0", "R3, 8 mm"] != rows["E2", "R3, 8 mm"]
+    (found,) = json.loads((tmp_path / "out" / "findings.json").read_text())["findings"]
+    assert (found["verdict"], found["value"]) == (True, rows["E2", "R3, 8 mm"] - rows["E2", "R3, 4 mm"])
+    assert "Over the conditions" in (tmp_path / "out" / "report.html").read_text()
+
+
 BAD = [
     (["study", "newton1687", "-o", "out"], 2, "'newton1687' is not a study; choose from guestrin2006"),
     (["study", "guestrin2006"], 2, "--output"),
@@ -117,8 +164,15 @@ BAD = [
     (["study", "guestrin2006", "-o", "out", "--eyes", ","], 2, "--eyes"),
     (["study", "guestrin2006", "-o", "out", "--protocol", "mine"], 2, "--protocol"),
     (["study", "guestrin2006", "-o", "out", "--observer", "mine"], 2, "--observer"),
-    (["study", "conditions", "-o", "out", "--observer", "image"], 2, "analytic observer only"),
-    (["study", "observers", "-o", "out", "--observer", "image"], 2, "compares both observers"),
+    (["study", "conditions", "-o", "out", "--observer", "image"], 2, "needs 'analytic'"),
+    (["study", "observers", "-o", "out", "--observer", "image"], 2, "needs 'both'"),
+    (["study", "guestrin2006", "-o", "out", "--people", "3"], 2, "draws no people"),
+    (["study", "no_module:Study", "-o", "out"], 2, "there is no module 'no_module'"),
+    (["study", "pathlib:Path", "-o", "out"], 2, "is not a subclass of eyerender.apps.Study"),
+    (["study", "own:Own", "-o", "out", "--population", "giants", "--people", "2"], 2, "giants"),
+    (["study", "own:Own", "-o", "out", "--population", "adults"], 2, "--people N"),
+    (["study", "own:Own", "-o", "out", "--people", "2", "--observer", "both"], 2, "ray optics only"),
+    (["study", "own:Broken", "-o", "out", "--eyes", "E1"], 2, "must be such as '< 0.1'"),
     (["study", "guestrin2006", "-o", "out", "--noise", "some"], 2, "--noise"),
     (["study", "guestrin2006", "-o", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
     (["study", "guestrin2006", "-o", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
@@ -134,6 +188,7 @@ def test_bad_input(tmp_path, monkeypatch, capsys, argv, code, words):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.txt").write_text("years of work")
     (tmp_path / "file").write_text("x")
+    (tmp_path / "own.py").write_text(OWN)
     before = sorted(str(p) for p in tmp_path.rglob("*"))
     assert run(argv) == code
     out, err = capsys.readouterr()
@@ -255,9 +310,10 @@ def test_shifts_of_mirrored_pupils_cancel_in_the_mean_of_both_eyes(conditions):
 
 def test_pupil_sizes_of_drawn_people():
     """Their eyes differ, so single eyes and the mean of both do; every curve meets its calibration at 4 mm."""
-    part = people_part()
-    assert len(part.diameters) == 4
-    for curves in part.diameters.values():
+    parts = [person_part({"preset": "adults", "seed": 0, "subject": k}) for k in range(2)]
+    assert parts[0].diameters != parts[1].diameters
+    for part in parts:
+        curves = part.diameters
         assert set(curves) == {
             f"{tracker}, {SHIFTED}"
             for tracker in ("model-based, right eye", "interpolation, both eyes", "interpolation, right eye",
@@ -266,7 +322,7 @@ def test_pupil_sizes_of_drawn_people():
         for values in curves.values():
             assert np.isfinite(values).all()
             assert np.argmin(values) in (1, 2, 3)  # 3, 4 or 5 mm
-    assert {row.eye for row in part.rows} == {"both", "right", "left"}
+        assert {row.eye for row in part.rows} == {"both", "right", "left"}
 
 
 @pytest.mark.slow

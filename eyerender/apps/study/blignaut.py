@@ -19,42 +19,12 @@ from ...scene import Scene, load_scene
 from ...scene.observation import Observations
 from ...scene.spec import SceneSpec
 from .authors_estimators import MinimumNormRegression
-from .literature import CALIBRATION_SETS
-from .results import Departure, Row, known_mean, mean_row
+from .literature import CALIBRATION_SETS, departures
+from .results import Row, known_mean, mean_row
 
 SCENE = "blignaut2014"
 
-DEPARTURES = (
-    Departure(
-        id="focal",
-        title="focal length in pixels",
-        paper="10 mm, 4.48 mm sensor",
-        software="3751.43 px at 1600 px (two digits of 3571.43 swapped)",
-        corrected="3571.43 px",
-    ),
-    Departure(id="screen", title="height of the screen", paper="-131.5 mm", software="-140 mm", corrected="-131.5 mm"),
-    Departure(
-        id="terms",
-        title="terms of the vertical function",
-        paper="Table 2",
-        software="the loop takes the index of the horizontal function for the vertical one too",
-        corrected="Table 2",
-    ),
-    Departure(
-        id="minimum_norm",
-        title="fewer targets than terms",
-        paper="not said",
-        software="the minimum-norm solution",
-        corrected="refused; no row",
-    ),
-    Departure(
-        id="error",
-        title="measure of the error",
-        paper="average angular error",
-        software="angle at the origin between (x, y, 800) of estimate and target, x and y from the screen's centre",
-        corrected="the angle at the mid-point of the eyes",
-    ),
-)
+DEPARTURES = departures(SCENE)
 PUBLISHED = frozenset(d.id for d in DEPARTURES)
 CORRECTED: frozenset[str] = frozenset()
 

@@ -11,7 +11,7 @@ Therefore the report also has the errors of the right eye alone, and those of a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,10 +27,10 @@ from ...gaze.quality import quality
 from ...gaze.regression import Regression
 from ...scene import Scene
 from ...scene.observation import EYES, Observations
-from ...scene.spec import SceneSpec
 from . import blignaut, guestrin
 from .literature import CALIBRATION_SETS
-from .results import Row, mean_row
+from .results import ModelResults, Row, mean_row
+from .study import changed, name_of, of_person
 
 TRACKERS = ("model-based", "interpolation")
 FUNCTION, CALIBRATION = "R8", "C14"
@@ -39,9 +39,7 @@ DIAMETERS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 HEAD_MM = (-40.0, -20.0, 0.0, 20.0, 40.0)
 GRID = (13, 11)
 NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
-DRAWN_PEOPLE = "drawn people"
-"""Name of the job of drawn people, among the names of eye models."""
-PEOPLE_PRESET, PEOPLE_SEED, PEOPLE = "adults", 0, 4
+PEOPLE = 4
 FIXED, SHIFTED = "centre fixed", "centre shifts"
 CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
 """Ways in which the pupil widens -> keys of the scene's eye."""
@@ -79,28 +77,19 @@ PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
 
 
 @dataclass(slots=True, kw_only=True)
-class ConditionsPart:
-    """Results of one eye model; errors in degrees.
+class ConditionsPart(ModelResults):
+    """Results of one eye model, or of one drawn person (`diameters` and rows only); errors in degrees.
 
     Maps (rows, columns) by tracker are NaN where there is no estimate.
     """
 
-    eye_model: str
+    person: Mapping[str, Any] | None = None
     screen_maps: dict[str, Floats] = field(default_factory=dict)
     head_maps: dict[str, Floats] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)
     """Mean errors over `DIAMETERS_MM`, by name of the curve: tracker, eyes, and how the pupil widens."""
     sensitivity: list[dict[str, Any]] = field(default_factory=list)
     precision: dict[str, dict[str, float]] = field(default_factory=dict)
-    rows: list[Row] = field(default_factory=list)
-
-
-@dataclass(slots=True)
-class PeoplePart:
-    """Mean errors (deg) of drawn people over `DIAMETERS_MM`, by subject and curve as in `ConditionsPart.diameters`."""
-
-    diameters: dict[int, dict[str, list[float]]] = field(default_factory=dict)
-    rows: list[Row] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +137,7 @@ def conditions_part(eye: str) -> ConditionsPart:
         both = {"eye": "both", "function": FUNCTION, "calibration": CALIBRATION}
         keys |= {"eye": "right"} if name == "model-based" else both
         columns, rows = GRID if name == "model-based" else (15, 9)
-        wide = _changed(tracker.scene, {"targets": {"grid": [columns, rows]}})
+        wide = changed(tracker.scene, {"targets": {"grid": [columns, rows]}})
         over = tracker.errors_deg(trace(wide))
         out.screen_maps[name] = over.reshape(columns, rows).T
         out.rows.append(mean_row(errors, variant=f"{name}, as calibrated", **keys))
@@ -179,24 +168,15 @@ def conditions_part(eye: str) -> ConditionsPart:
     return out
 
 
-def people_part() -> PeoplePart:
-    """Compute the errors over the pupil's diameter for a few drawn people."""
-    out = PeoplePart()
-    for subject in range(PEOPLE):
-        out.diameters[subject] = {}
-        for name in TRACKERS:
-            choice = {"preset": PEOPLE_PRESET, "seed": PEOPLE_SEED, "subject": subject}
-            data = _scene(name, "E2").spec.to_mapping()
-            data["subject"].pop("ipd_mm", None)
-            data["eye"] = {"pupil_diameter_mm": data["eye"].get("pupil_diameter_mm") or CALIBRATED_MM}
-            data = {key: value for key, value in data.items() if key not in ("look", "region")}
-            scene = Scene.of(SceneSpec.from_mapping({**data, "population": choice}, source=name))
-            tracker, _ = _calibrated(scene)
-            label = f"{PEOPLE_PRESET} {PEOPLE_SEED}/{subject}"
-            # A person's eye file has its own shift of the centre.
-            curves, rows = _over_diameters(tracker, label, sides=("both", *EYES), centres={SHIFTED: {}})
-            out.diameters[subject] |= curves
-            out.rows += rows
+def person_part(person: Mapping[str, Any]) -> ConditionsPart:
+    """Compute the errors over the pupil's diameter for one drawn person."""
+    out = ConditionsPart(eye_model=name_of(person), person=person)
+    for name in TRACKERS:
+        tracker, _ = _calibrated(of_person(_scene(name, "E2"), person))
+        # A person's eye file has its own shift of the centre.
+        curves, rows = _over_diameters(tracker, out.eye_model, sides=("both", *EYES), centres={SHIFTED: {}})
+        out.diameters |= curves
+        out.rows += rows
     return out
 
 
@@ -208,7 +188,7 @@ def _over_diameters(
     rows = []
     for centre, keys in (CENTRES if centres is None else centres).items():
         for diameter in DIAMETERS_MM:
-            scene = _changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter, **keys}})
+            scene = changed(tracker.scene, {"eye": {"pupil_diameter_mm": diameter, **keys}})
             for side, errors in tracker.errors_by_eye_deg(trace(scene)).items():
                 if side not in sides:
                     continue
@@ -233,16 +213,7 @@ def _scene(tracker: str, eye: str) -> Scene:
     if tracker == "interpolation":
         return blignaut.scene(eye, blignaut.CORRECTED)
     scene = guestrin.scene(eye, guestrin.CORRECTED)
-    return _changed(scene, {"subject": {"eyes": ["right"], "head_positions_mm": [[0.0, 0.0, 0.0]]}})
-
-
-def _changed(scene: Scene, changes: dict[str, dict[str, Any]]) -> Scene:
-    """Replace keys of a scene's groups; the eye's spec stays."""
-    data = scene.spec.to_mapping()
-    for group, values in changes.items():
-        data[group] = values if group == "targets" else {**data[group], **values}
-    spec = SceneSpec.from_mapping(data)
-    return scene.replaced(spec)
+    return changed(scene, {"subject": {"eyes": ["right"], "head_positions_mm": [[0.0, 0.0, 0.0]]}})
 
 
 def _calibrated(scene: Scene) -> tuple[_Tracker, Observations]:
@@ -265,7 +236,7 @@ def _mean(scene: Scene) -> float:
 def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[Row]]:
     """Compute mean errors (depth, sideways) of nine targets over head positions."""
     places = [[x, y, 0.0] for x in HEAD_MM for y in HEAD_MM]
-    scene = _changed(tracker.scene, {"targets": {"grid": [3, 3]}, "subject": {"head_positions_mm": places}})
+    scene = changed(tracker.scene, {"targets": {"grid": [3, 3]}, "subject": {"head_positions_mm": places}})
     errors = tracker.errors_deg(trace(scene)).reshape(len(places), -1)
     rows = [
         mean_row(e, variant=f"{tracker.name}, head at ({p[0]:g}, {p[1]:g}, 0) mm", **keys)

@@ -1,15 +1,19 @@
-"""Feature clouds (the paper's Figure 3): pupil centres and glints of 135 fixations, and findings F1 to F4 on them."""
+"""Feature clouds (the paper's Figure 3): pupil centres and glints of 135 fixations, and findings F1 to F9 on them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...base.arrays import Floats
+from ...eye.catalogue import load_eye
+from ...eye.spec import EyeSpec
+from ...scene import Scene
 from ...scene.observation import Observations
-from .literature import SENTENCES
+from .findings import Rules
+from .literature import CONIC
 from .results import Finding
 
 COLUMNS, ROWS = 15, 9
@@ -56,49 +60,106 @@ def bow(points: Floats) -> float:
     return float(np.mean(out))
 
 
-def findings(clouds: Mapping[str, Cloud], protocol: str, observer: str) -> list[Finding]:
-    """Test F1 to F4 for the models that were run."""
-    out = []
+def apart(a: Cloud, b: Cloud, part: str, *, centred: bool = False) -> float:
+    """Compute the rms distance between two clouds, over the width of the second."""
+    p, q = getattr(a, part), getattr(b, part)
+    away = p - q
+    if centred:
+        away = away - np.nanmean(away, axis=0)
+    return float(np.sqrt(np.nanmean((away**2).sum(axis=1)))) / float(np.ptp(q[:, 0]))
 
-    def add(name: str, rule: str, value: float, threshold: str, verdict: bool, detail: str) -> None:
-        out.append(
-            Finding(name, protocol, observer, rule, float(value), threshold, bool(verdict), detail, SENTENCES[name])
-        )
 
+def turned_like_e2(eye: str, scene: Scene) -> Scene | None:
+    """Turn E1 and E5 about the centre of rotation of E2, to test what the centres cause; None for other models."""
+    if eye not in ("E1", "E5"):
+        return None
+    data = scene.eye_spec.to_mapping()
+    data["rotation"] = load_eye("E2").to_mapping()["rotation"]
+    return scene.replaced(eye_spec=EyeSpec.from_mapping(data))
+
+
+def findings(
+    clouds: Mapping[str, Cloud], protocol: str, observer: str, turned: Mapping[str, Cloud] | None = None
+) -> list[Finding]:
+    """Test F1 to F9 for the models that were run; `turned` are clouds of `turned_like_e2`."""
+    rule = Rules(protocol, observer)
+    found = [one for test in (_size, _aspects, _bows, _four_surfaces) for one in test(rule, clouds)]
+    return [*found, *_centres(rule, clouds, turned or {})]
+
+
+_PARTS = {"pupil": "pupil_px", "glint": "glint_px"}
+
+
+def _size(rule: Rules, clouds: Mapping[str, Cloud]) -> Iterator[Finding]:
+    """Test F1: E1's clouds are small, and its glint stands still."""
     if "E1" in clouds:
-        moved = extent_px(clouds["E1"].glint_px)
-        add(
-            "F1", "E1's glint does not move when the eye turns: largest distance from its mean (px)", moved,
-            "< 0.001", moved < 1e-3, "E1 turns about the centre of its spherical cornea",
-        )  # fmt: skip
+        about = "E1 turns about the centre of its spherical cornea"
+        yield rule("F1 glint", extent_px(clouds["E1"].glint_px), detail=about)
+        sizes = {n: np.ptp(c.pupil_px, axis=0) for n, c in clouds.items()}
+        ratios = {n: float((sizes["E1"] / size).max()) for n, size in sizes.items() if n != "E1"}
+        if ratios:
+            yield rule("F1 size", ratios, max)
+
+
+def _aspects(rule: Rules, clouds: Mapping[str, Cloud]) -> Iterator[Finding]:
+    """Test F2: E5's clouds are flatter."""
     if "E5" in clouds and len(clouds) > 1:
-        shapes = {n: (aspect(c.pupil_px), aspect(c.glint_px)) for n, c in clouds.items()}
+        pupils = {f"{n} pupils": aspect(c.pupil_px) for n, c in clouds.items()}
         # E1's glint is a point, which has no aspect.
-        others = [min(s[0] for n, s in shapes.items() if n != "E5")]
-        others += [min((s[1] for n, s in shapes.items() if n not in ("E1", "E5")), default=np.inf)]
-        ratio = max(shapes["E5"][0] / others[0], shapes["E5"][1] / others[1])
-        detail = "; ".join(
-            f"{n} pupil {s[0]:.3f}" + (f", glint {s[1]:.3f}" if n != "E1" else "") for n, s in shapes.items()
+        glints = {f"{n} glints": aspect(c.glint_px) for n, c in clouds.items() if n != "E1"}
+        ratio = max(
+            by.pop(key) / min(by.values(), default=np.inf)
+            for by, key in ((dict(pupils), "E5 pupils"), (dict(glints), "E5 glints"))
         )
-        add(
-            "F2", "E5's clouds are flatter than every other model's: its aspect over the smallest other one", ratio,
-            "< 1", ratio < 1, detail,
-        )  # fmt: skip
+        yield rule("F2", {**pupils, **glints}, lambda _: ratio)
+
+
+def _bows(rule: Rules, clouds: Mapping[str, Cloud]) -> Iterator[Finding]:
+    """Test F4 to F6: rows of targets bend more with conic corneas, and most with E5."""
+    conic = [n for n in CONIC if n in clouds]
+    for name, part in _PARTS.items():
+        bows = {n: bow(getattr(clouds[n], part)) for n in ("E3", *CONIC, "E5") if n in clouds}
+        if conic and "E3" in bows:
+            rise = min(bows[n] for n in conic) - bows["E3"]
+            yield rule("F4", bows, lambda _, rise=rise: rise, part=name)
+        if "E5" in bows and len(bows) > 1:
+            ratio = bows["E5"] / max(v for n, v in bows.items() if n != "E5")
+            yield rule("F5", bows, lambda _, ratio=ratio: ratio, part=name)
+    if conic and "E3" in clouds:
+        # The image's y is down, so the top left corner of the figure has the smallest x + y.
+        corner = int(np.argmin(clouds["E3"].glint_px.sum(axis=1)))
+        middle = COLUMNS // 2 * ROWS + ROWS // 2
+        away = {n: np.linalg.norm(clouds[n].glint_px - clouds["E3"].glint_px, axis=1) for n in conic}
+        yield rule("F6", {n: float(d[corner] - d[middle]) for n, d in away.items()}, min)
+
+
+def _four_surfaces(rule: Rules, clouds: Mapping[str, Cloud]) -> Iterator[Finding]:
+    """Test F3, F7 and F9: what asphericity, posterior cornea and lens, and the finite model change."""
     if {"E3", "E4"} <= set(clouds):
-        a, b = clouds["E3"].pupil_px, clouds["E4"].pupil_px
-        apart = float(np.sqrt(np.nanmean(((a - b) ** 2).sum(axis=1)))) / float(np.ptp(a[:, 0]))
-        add(
-            "F3", "the pupil clouds of E3 and E4 nearly coincide: rms distance over the cloud's width", apart, "< 0.02",
-            apart < 0.02, "",
-        )  # fmt: skip
-    order = [n for n in ("E3", "E2", "E4", "E5") if n in clouds]
-    if len(order) > 1:
-        bows = [bow(clouds[n].glint_px) for n in order]
-        rise = float(min(np.diff(bows)))
-        add(
-            "F4",
-            "the glint clouds bend more with the cornea's asphericity (Q 0, -.25, -.26, -.27/-.36 for E3, E2, E4, E5): "
-            "smallest rise of the rows' bow from one to the next",
-            rise, "> 0", bool(rise > 0), ", ".join(f"{n} {v:.4f}" for n, v in zip(order, bows, strict=True)),
-        )  # fmt: skip
-    return out
+        found = {name: apart(clouds["E4"], clouds["E3"], part) for name, part in _PARTS.items()}
+        yield rule("F3 pupil", found["pupil"])
+        yield rule("F3 glint", found, lambda both: both[1] if both[1] > both[0] else np.nan)
+    if {"E2", "E4"} <= set(clouds):
+        yield rule("F7", {name: apart(clouds["E4"], clouds["E2"], part) for name, part in _PARTS.items()}, max)
+    if {"E2", "E4", "E5"} <= set(clouds):
+        ratios = {
+            name: min(apart(clouds["E5"], clouds[n], part, centred=True) for n in CONIC)
+            / apart(clouds["E4"], clouds["E2"], part, centred=True)
+            for name, part in _PARTS.items()
+        }
+        yield rule("F9", ratios, min)
+
+
+def _centres(rule: Rules, clouds: Mapping[str, Cloud], turned: Mapping[str, Cloud]) -> Iterator[Finding]:
+    """Test F8: turned about the centre of E2, E1 and E5 lose most of what distinguishes them from it."""
+    measures: dict[str, tuple[str, Callable[[Cloud], float]]] = {
+        "E1": ("width of the pupil cloud", lambda c: float(np.ptp(c.pupil_px[:, 0]))),
+        "E5": ("aspect of the pupil cloud", lambda c: aspect(c.pupil_px)),
+    }
+    for model, (what, measure) in measures.items():
+        if {model, "E2"} <= set(clouds) and model in turned:
+            found = {"E2": clouds["E2"], model: clouds[model], "turned": turned[model]}
+            base, own, other = values = [measure(c) for c in found.values()]
+            left = abs(other - base) / (abs(own - base) or np.nan)
+            shown = dict(zip(found, values, strict=True))
+            yield rule("F8", shown, lambda _, left=left: left, model=model, what=what)

@@ -92,48 +92,34 @@ def heads_figure(
         return svg(fig)
 
 
-def sets_figure(
-    sets: Sequence[str], own: Mapping[str, Mapping[str, Sequence[float]]], measured: Sequence[float]
+def rows_figure(
+    labels: Sequence[str],
+    panels: Mapping[str, Mapping[str, Sequence[float | None]]],
+    xlabel: str,
+    *,
+    joined: bool = False,
 ) -> str:
-    """Draw Figure 5: the best function's error for each calibration set by eye model; one panel per label of `own`."""
-    columns = min(len(own), 3)
-    lines = -(-len(own) // columns)
-    with figure(max(5.4, 4.6 * columns), 0.5 + 3.7 * lines, columns, lines) as (fig, axes):
-        panels = np.atleast_1d(axes).ravel()
-        top = 2.0 * max(measured)
-        for empty in panels[len(own) :]:
-            empty.set_axis_off()
-        for ax, (label, by_model) in zip(panels, own.items(), strict=False):
-            x = np.arange(len(sets))
-            ax.plot(x, measured, color=_MEASURED, marker="x", lw=1.6, label="experiment (26 people)")
-            for model, values in by_model.items():
-                colour, marker = look(model, list(by_model))
-                ax.plot(x, values, color=colour, marker=marker, ms=6, lw=1.2, label=model)
-            log_scale(ax.yaxis)
-            ax.set_ylim(0.02, top)
-            ticks = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
-            ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
-            ax.minorticks_off()
-            ax.set_xticks(x, sets)
-            ax.set(title=label, xlabel="calibration set", ylabel="error of the best function (deg)")
-        legend_above(fig, panels[0], 6)
-        return svg(fig)
+    """Draw values of labelled rows by eye model: panel -> eye model -> value (None or NaN: none).
 
-
-def waterfall_figure(labels: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float | None]]]) -> str:
-    """Draw the mean error after each correction, from published to corrected, by eye model; one panel per measure."""
+    `joined` values, such as errors after one correction after the other, are connected and start at 0; others lie
+    side by side about 0.
+    """
     with figure(max(7.0, 2.6 + 3.2 * len(panels)), 1.6 + 0.36 * len(labels), len(panels)) as (fig, axes):
         fig.get_layout_engine().set(wspace=0.06)  # the last tick label of one panel is next to the first of the next
         y = np.arange(len(labels))
         for k, (ax, (name, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
-            for model, values in by_model.items():
+            for i, (model, values) in enumerate(by_model.items()):
                 colour, marker = look(model, list(by_model))
-                line = [np.nan if v is None else v for v in values]
-                ax.plot(line, y, color=colour, marker=marker, ms=5.5, lw=1.2, label=model)
+                shift = 0.0 if joined else (i - (len(by_model) - 1) / 2) * 0.13
+                x = [np.nan if v is None else v for v in values]
+                ax.plot(x, y + shift, color=colour, marker=marker, ms=5.5, lw=1.2 if joined else 0, label=model)
             ax.set_ylim(len(labels) - 0.5, -0.5)
             ax.set_yticks(y, labels if k == 0 else [""] * len(labels))
-            ax.set_xlim(left=0)
-            ax.set(title=name, xlabel="mean error (deg)")
+            if joined:
+                ax.set_xlim(left=0)
+            else:
+                ax.axvline(0, color="#444444", lw=0.8)
+            ax.set(title=name, xlabel=xlabel)
         legend_above(fig, np.atleast_1d(axes)[0], 6)
         return svg(fig)
 
@@ -157,32 +143,35 @@ def map_figure(
 
 
 def lines_figure(
-    panels: Mapping[str, Mapping[str, Sequence[float]]], x: Sequence[float], xlabel: str, ylabel: str
+    panels: Mapping[str, Mapping[str, Sequence[float]]],
+    x: Sequence[float],
+    xlabel: str,
+    ylabel: str,
+    ticks: Sequence[str] | None = None,
+    measured: Sequence[float] | None = None,
 ) -> str:
-    """Draw lines by eye model over one quantity; one panel per key."""
-    with figure(max(5.4, 4.4 * len(panels)), 3.6, len(panels)) as (fig, axes):
-        for ax, (name, by_model) in zip(np.atleast_1d(axes), panels.items(), strict=True):
+    """Draw lines by eye model over one quantity, or over what `ticks` name; one panel per key.
+
+    With `measured` values of an experiment beside them, the axis is logarithmic.
+    """
+    columns = min(len(panels), 3)
+    lines = -(-len(panels) // columns)
+    with figure(max(5.4, 4.4 * columns), 3.6 * lines, columns, lines) as (fig, axes):
+        shown = np.atleast_1d(axes).ravel()
+        for empty in shown[len(panels) :]:
+            empty.set_axis_off()
+        for ax, (name, by_model) in zip(shown, panels.items(), strict=False):
+            if measured is not None:
+                ax.plot(x, measured, color=_MEASURED, marker="x", lw=1.6, label="experiment")
             for model, values in by_model.items():
                 colour, marker = look(model, list(by_model))
                 ax.plot(x, values, color=colour, marker=marker, ms=5.5, lw=1.2, label=model)
-            ax.set_ylim(bottom=0)
+            if measured is None:
+                ax.set_ylim(bottom=0)
+            else:
+                log_scale(ax.yaxis)
+            if ticks is not None:
+                ax.set_xticks(x, ticks)
             ax.set(title=name, xlabel=xlabel, ylabel=ylabel)
-        legend_above(fig, np.atleast_1d(axes)[0], 6)
-        return svg(fig)
-
-
-def sensitivity_figure(names: Sequence[str], panels: Mapping[str, Mapping[str, Sequence[float]]], xlabel: str) -> str:
-    """Draw changes by one step of each parameter, one row each: panel -> eye model -> change (NaN: none)."""
-    with figure(11.0, 1.3 + 0.36 * len(names), len(panels)) as (fig, axes):
-        y = np.arange(len(names))
-        for k, (ax, (title, by_model)) in enumerate(zip(np.atleast_1d(axes), panels.items(), strict=True)):
-            ax.axvline(0, color="#444444", lw=0.8)
-            for i, (model, values) in enumerate(by_model.items()):
-                colour, marker = look(model, list(by_model))
-                shift = (i - (len(by_model) - 1) / 2) * 0.13
-                ax.scatter(values, y + shift, s=30, marker=marker, color=colour, label=model, zorder=3)
-            ax.set_yticks(y, names if k == 0 else [""] * len(names))
-            ax.set_ylim(len(names) - 0.5, -0.5)
-            ax.set(title=title, xlabel=xlabel)
-        legend_above(fig, np.atleast_1d(axes)[0], 6)
+        legend_above(fig, shown[0], 6)
         return svg(fig)

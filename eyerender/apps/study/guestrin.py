@@ -20,77 +20,14 @@ from ...scene import Scene, load_scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
 from .authors_estimators import AuthorsGuestrinEizenman
-from .results import Departure, Row, known_mean, mean_row
+from .literature import departures
+from .results import Row, known_mean, mean_row
 
 SCENE = "guestrin2006"
 HEADS = ("H1", "H2")
 STARTS, SEED = 20, 2006
 
-DEPARTURES = (
-    Departure(
-        id="eyes",
-        title="one eye",
-        paper="the participant's eyes",
-        software="the right eye only",
-        corrected="both eyes, reported per eye and pooled",
-    ),
-    Departure(
-        id="lights",
-        title="lights",
-        paper="(615, IPD/2 +- 208.5, 0) mm",
-        software="(650, IPD/2 +- 188.5, 0) mm, in the screen's plane",
-        corrected="(615, +-208.5, 0) mm as in Table 4",
-    ),
-    Departure(
-        id="heads",
-        title="head positions",
-        paper="30 cm to each side, 40 cm forward and back",
-        software="30 mm up and down, 40 mm to each side, in the screen's plane",
-        corrected="30 mm to each side, 40 mm forward and back",
-    ),
-    Departure(
-        id="plane",
-        title="screen plane",
-        paper="x = 650 mm",
-        software="gaze met with x = 651 mm, compared with targets at 650 mm",
-        corrected="x = 650 mm",
-    ),
-    Departure(
-        id="error",
-        title="measure of the error",
-        paper="average angular error",
-        software="atan(distance / 650 mm), wherever the head stands",
-        corrected="the angle at the eye",
-    ),
-    Departure(
-        id="centre",
-        title="centre of corneal curvature",
-        paper="the algorithm of [28], from both glints",
-        software="on the line common to both planes, mirror condition of light 1 only",
-        corrected="from both glints (method A)",
-    ),
-    Departure(
-        id="index",
-        title="index behind the cornea",
-        paper="calibrated",
-        software="fixed at 1.376",
-        corrected="fixed at 1.3375, and calibrated",
-    ),
-    Departure(
-        id="visual_axis",
-        title="visual axis",
-        paper="offset by the angle alpha",
-        software="the optic axis turned by a rotation fixed in the world (beta about y, then alpha about z)",
-        corrected="azimuth + alpha, elevation + beta",
-    ),
-    Departure(
-        id="objective",
-        title="calibration",
-        paper="the values that minimise the error at H1",
-        software="sum of errors; R 3..20 mm, K 2..15 mm, alpha -10..10 deg, beta -5..5 deg",
-        corrected="least squares; R 6.5..9.5 mm, K 3..6 mm, alpha -10..10 deg, beta -6..6 deg, n 1.30..1.45",
-    ),
-)
+DEPARTURES = departures(SCENE)
 PUBLISHED = frozenset(d.id for d in DEPARTURES)
 CORRECTED: frozenset[str] = frozenset()
 

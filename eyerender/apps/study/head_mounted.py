@@ -11,7 +11,7 @@ between the true direction and the estimated one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,15 @@ from ...gaze.budget import error_vectors_deg
 from ...gaze.builtin import Feature
 from ...gaze.directions import DirectionRegression
 from ...optics.transforms import direction_of
+from ...report.page import Card, number
 from ...rig.rig import RigGeometry
 from ...scene import Scene, load_scene
 from ...scene.observation import Observations
 from ...scene.spec import SceneSpec
-from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
-from .observing import Observing
-from .results import Finding, ModelResults, mean_row, over_seeds
+from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference, compare_observers
+from .page_parts import ABOUT_OBSERVERS, Apart
+from .results import Finding, ModelResults, Row, mean_row
+from .study import EstimatorErrors, Study, StudyJob
 
 SCENE, PROTOCOL = "head_mounted", "head-mounted"
 AZIMUTHS_DEG = (15.0, 7.5, 0.0, -7.5, -15.0)
@@ -51,31 +53,60 @@ def calibration_rows() -> Bools:
     return np.array([x in a and y in e for y in ELEVATIONS_DEG for x in AZIMUTHS_DEG])
 
 
-def head_mounted_part(eye: str, observings: Sequence[Observing]) -> ModelResults:
-    """Compute the results of one eye model with the given observers."""
-    own = scene(eye)
-    out = ModelResults(eye_model=eye)
-    learnt = calibration_rows()
-    for observing in observings:
-        seen = observing.observe(own)
-        key = PROTOCOL, observing.kind
-        out.seen[key] = own.rig, seen
-        again = [one.observe(own) for one in observing.exposures()]
-        out.seed_vectors[key] = over_seeds(
-            [{name: direction_errors_deg(one, own.rig, name) for name in FEATURES} for one in again]
-        )
-        out.errors[key], out.vectors[key] = {}, {}
-        for name in FEATURES:
-            vector = direction_errors_deg(seen, own.rig, name)
-            error = np.linalg.norm(vector, axis=1)
-            out.errors[key][name], out.vectors[key][name] = error, vector
-            out.rows.append(
-                mean_row(
-                    error[~learnt], protocol=PROTOCOL, observer=observing.kind, variant=name, eye_model=eye,
-                    eye="right", function="second order",
-                )
-            )  # fmt: skip
-    return out
+class ObserversStudy(Study):
+    """Both observers before the head-mounted rig."""
+
+    title = "The observers on a head-mounted rig"
+    about = (
+        "An eye camera is 35 mm in front of the right eye, with a ring of six LEDs around it. Both observers see the "
+        f"eye in 5 x 5 directions, up to {max(AZIMUTHS_DEG):g} deg to each side and {max(ELEVATIONS_DEG):g} deg up and "
+        "down. A second-order polynomial maps a feature to the azimuth and elevation of the optic axis. It is fitted "
+        "on nine directions and tested on the sixteen between them.",
+        ABOUT_OBSERVERS,
+    )
+    protocols = (PROTOCOL,)
+    population = None
+    observers = ("both",)
+    shown = tuple(FEATURES)
+    method = "the polynomial"
+
+    def scenes(self, job: StudyJob, protocol: str) -> Mapping[str, Scene]:
+        """Build the scene."""
+        return {"": scene(job.who)}
+
+    def estimates(
+        self, scenes: Mapping[str, Scene], seen: Mapping[str, Observations], protocol: str
+    ) -> dict[str, EstimatorErrors]:
+        """Estimate the directions from each feature."""
+        vectors = {name: direction_errors_deg(seen[""], scenes[""].rig, name) for name in FEATURES}
+        return {n: EstimatorErrors(error_deg=np.linalg.norm(v, axis=1), vector_deg=v) for n, v in vectors.items()}
+
+    def rows(self, done: Mapping[str, Any], seen: Any, keys: Mapping[str, Any]) -> Sequence[Row]:
+        """Return the rows of the sixteen tested directions."""
+        tested, more = ~calibration_rows(), {"eye": "right", "function": "second order"}
+        return [mean_row(one.error_deg[tested], variant=name, **more, **keys) for name, one in done.items()]
+
+    def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
+        """Return the effects of images on features and directions as findings without a published claim."""
+        return findings(*compare_observers(parts))
+
+    def more(self, parts: Sequence[ModelResults], protocols: Sequence[str]) -> dict[str, Any]:
+        """Return the scene and its directions."""
+        return {
+            "scene": SCENE,
+            "directions_deg": {"azimuth": list(AZIMUTHS_DEG), "elevation": list(ELEVATIONS_DEG)},
+            "calibrated_on": int(calibration_rows().sum()),
+            "tested_on": int((~calibration_rows()).sum()),
+        }
+
+    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> Any:
+        """Return a card per observer with the distances of the pupil's centre by eye model."""
+        by: dict[str, list[str]] = {}
+        for f in apart[0]:
+            if f.feature == "pupil centre":
+                by.setdefault(f.observer, []).append(f"{f.eye_model}\u00a0{number(f.median_distance_px, 3)}")
+        text = "median distance of the pupil centre from ray optics (px)"
+        return [Card(" ".join(values), f"{text}, {observer}") for observer, values in by.items()], None
 
 
 def directions_deg() -> Floats:
@@ -118,16 +149,6 @@ def findings(features: Sequence[FeatureDifference], gaze: Sequence[GazeDifferenc
         detail = f"95 % interval {g.low_deg:.4f} to {g.high_deg:.4f}; {g.analytic_deg:.4f} deg from rays"
         out.append(Finding("O3", g.protocol, g.observer, rule, g.difference_deg, "none", None, detail))
     return out
-
-
-def more() -> dict[str, Any]:
-    """Return the content of the summary besides its rows."""
-    return {
-        "scene": SCENE,
-        "directions_deg": {"azimuth": list(AZIMUTHS_DEG), "elevation": list(ELEVATIONS_DEG)},
-        "calibrated_on": int(calibration_rows().sum()),
-        "tested_on": int((~calibration_rows()).sum()),
-    }
 
 
 def _mm(value: float | None) -> str:

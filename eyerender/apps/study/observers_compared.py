@@ -6,6 +6,7 @@ paired difference = mean(error from images - error from rays) with its 95 % conf
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from ...gaze.budget import mean_interval
 from ...imaging.comparison import feature_errors
 from ...rig.rig import RigGeometry
 from ...scene.observation import Observations
+from .results import ModelResults
 
 ALL_GLINTS = "all glints"
 
@@ -103,6 +105,24 @@ def gaze(
         analytic_deg=float(analytic_deg[both].mean()), image_deg=float(image_deg[both].mean()),
         difference_deg=difference, low_deg=low, high_deg=high,
     )  # fmt: skip
+
+
+def compare_observers(parts: Sequence[ModelResults]) -> tuple[list[FeatureDifference], list[GazeDifference]]:
+    """Compare the observers on the frames that both have observed."""
+    found: list[FeatureDifference] = []
+    effects: list[GazeDifference] = []
+    seen = {(p.eye_model, *key): (p, key) for p in parts for key in p.seen}
+    for (model, protocol, observer), (other, key) in seen.items():
+        analytic = seen.get((model, protocol, "analytic"))
+        if observer == "analytic" or analytic is None:
+            continue
+        part, own = analytic
+        rig, truth = part.seen[own]
+        found += features(truth, other.seen[key][1], rig, protocol, observer, model)
+        mine, theirs = part.errors[own], other.errors[key]
+        compared = [gaze(mine[n], theirs[n], protocol, observer, model, n) for n in mine if n in theirs]
+        effects += [one for one in compared if one]
+    return found, effects
 
 
 def _difference(vectors: Floats, mm_per_px: Floats) -> dict[str, Any]:

@@ -8,12 +8,17 @@ from typing import Literal
 from ...backends.choose import BackendChoice
 from ...base.errors import InputError
 
+MOST_PEOPLE = 100_000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyOptions:
     """Options of a study.
 
     Attributes:
+        population: Preset from which people are drawn (default: adults).
+        people: Number of people, in place of eye models unless --eyes names some (default: none; rigs: 100;
+            conditions: 4, beside the models).
         protocol: guestrin2006 and blignaut2014: as the authors' software computes (published), as the paper describes
             (corrected), or both.
         observer: Features from ray optics (analytic), from rendered images (image), or both for comparison (default:
@@ -30,6 +35,8 @@ class StudyOptions:
         overwrite: Replace the contents of the folder.
     """
 
+    population: str | None = None
+    people: int | None = None
     protocol: Literal["corrected", "published", "both"] = "both"
     observer: Literal["analytic", "image", "both"] | None = None
     workers: int | None = None
@@ -42,6 +49,8 @@ class StudyOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        if self.people is not None and not 1 <= self.people <= MOST_PEOPLE:
+            raise InputError(f"must be 1 to {MOST_PEOPLE}, not {self.people}", path="people")
         for name in ("workers", "spp", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:

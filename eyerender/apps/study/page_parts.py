@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
-from ...report.page import Card, Figure, Section, Table, number
+from ...report.page import Card, Figure, Section, Table, number, table_of
 from .budget import ALGORITHM, BOTH, EYE, IMAGE, NOISE, Budget, Term
-from .figures import waterfall_figure
+from .figures import rows_figure
 from .observer_figures import budget_figure, differences_figure, distances_figure
 from .observers_compared import ALL_GLINTS, FeatureDifference, GazeDifference
 from .results import Departure, Erratum, Finding, WaterfallStep
@@ -159,24 +160,12 @@ def observers_section(apart: Apart, shown: Sequence[str] = ()) -> Section | None
             "The effect on the gaze error: mean of the paired differences, image minus analytic, with its 95 % "
             "confidence interval. Above zero, images increase the error.",
         )
-    feature_table = Table(
-        (
-            "protocol", "observer", "eye model", "feature", "n", "missing", "bias x (px)", "bias y (px)", "SD x (px)",
-            "SD y (px)", "median distance (px)", "bias at the eye (µm)", "SD at the eye (µm)",
-        ),
-        [_feature_row(f) for f in features],
-        caption="Features: bias and spread, in px and at the eye",
-        folded=len(features) > 30,
-    )  # fmt: skip
-    gaze_table = Table(
-        (
-            "protocol", "observer", "eye model", "estimator", "n", "analytic (deg)", "image (deg)", "difference (deg)",
-            "95 % interval",
-        ),
-        [_gaze_row(g) for g in gaze],
-        caption="Gaze errors: paired differences, image minus analytic",
-        folded=len(gaze) > 20,
-    )  # fmt: skip
+    features_caption, gaze_caption = (
+        "Features: bias and spread, in px and at the eye",
+        "Gaze errors: paired differences, image minus analytic",
+    )
+    feature_table = table_of(features, _FEATURE_COLUMNS, features_caption, folded=len(features) > 30)
+    gaze_table = table_of(gaze, _GAZE_COLUMNS, gaze_caption, folded=len(gaze) > 20)
     return Section(
         "The observers compared",
         "The tables give image-derived minus analytic features of the same frames, and the resulting gaze errors. "
@@ -207,43 +196,42 @@ def _panels(names: Sequence[str], series: Sequence[tuple[str, str]], values: Map
     }
 
 
-def _feature_row(f: FeatureDifference) -> tuple[str, ...]:
-    return (
-        f.protocol, f.observer, f.eye_model, f.feature, str(f.n), str(f.missing), number(f.bias_x_px, 3),
-        number(f.bias_y_px, 3), number(f.sd_x_px, 3), number(f.sd_y_px, 3), number(f.median_distance_px, 3),
-        _micrometres(f.bias_mm), _micrometres(f.sd_mm),
-    )  # fmt: skip
+def _micrometres(key: str) -> Callable[[FeatureDifference], str]:
+    return lambda f: number(None if getattr(f, key) is None else 1000 * getattr(f, key), 1)
 
 
-def _gaze_row(g: GazeDifference) -> tuple[str, ...]:
-    return (
-        g.protocol, g.observer, g.eye_model, g.estimator, str(g.n), number(g.analytic_deg), number(g.image_deg),
-        number(g.difference_deg), f"{g.low_deg:.4f} to {g.high_deg:.4f}",
-    )  # fmt: skip
+_OBSERVED = {"protocol": "protocol", "observer": "observer", "eye model": "eye_model"}
+_FEATURE_COLUMNS: dict[str, Any] = {
+    **_OBSERVED, "feature": "feature", "n": "n", "missing": "missing", "bias x (px)": "bias_x_px",
+    "bias y (px)": "bias_y_px", "SD x (px)": "sd_x_px", "SD y (px)": "sd_y_px",
+    "median distance (px)": "median_distance_px", "bias at the eye (µm)": _micrometres("bias_mm"),
+    "SD at the eye (µm)": _micrometres("sd_mm"),
+}  # fmt: skip
+_GAZE_COLUMNS: dict[str, Any] = {
+    **_OBSERVED, "estimator": "estimator", "n": "n", "analytic (deg)": "analytic_deg", "image (deg)": "image_deg",
+    "difference (deg)": "difference_deg", "95 % interval": lambda g: f"{g.low_deg:.4f} to {g.high_deg:.4f}",
+}  # fmt: skip
+_ROW_COLUMNS: dict[str, Any] = {
+    **_OBSERVED, "variant": "variant", "eye": "eye", "head": "head", "calibration": "calibration",
+    "function": "function", "mean (deg)": "mean_deg", "SD (deg)": "sd_deg", "n": "n", "missing": "missing",
+    "in image": "in_image",
+}  # fmt: skip
 
 
-def _micrometres(mm: float | None) -> str:
-    return number(None if mm is None else 1000 * mm, 1)
+def rows_section(parts: Sequence[Any], text: str = "", more: Mapping[str, Any] | None = None) -> Section:
+    """List every mean; `more` are further columns."""
+    rows = [row for part in parts for row in part.rows]
+    table = table_of(rows, {**_ROW_COLUMNS, **(more or {})}, "Every mean", folded=len(rows) > 20)
+    return Section("Values", text or None, table)
 
 
 def findings_section(found: Sequence[Finding]) -> Section:
     """List every finding; one row per statement and a column per observer, where several tested it."""
-    told = {True: "true", False: "false", None: ""}
-    rows = [
-        (
-            f.id, told[f.verdict] or "-", f.rule, "-" if f.value is None else f"{f.value:.4g}", f.threshold,
-            f.protocol, f.observer, f.detail, f.sentence,
-        )
-        for f in found
-    ]  # fmt: skip
-    header = (
-        "id", "verdict", "statement: value", "value", "threshold", "protocol", "observer", "detail",
-        "the paper's sentence",
-    )  # fmt: skip
+    details = table_of(found, _FINDING_COLUMNS, wide=(2, 7, 8))
     keys = list(dict.fromkeys((f.protocol, f.observer) for f in found))
     text = "Each statement is tested on the data of this run. Its value is shown beside its threshold."
     if len(keys) < 3:
-        return Section("Findings", text, Table(header, rows, wide=(2, 5, 7, 8)))
+        return Section("Findings", text, details)
     by = {(f.id, f.rule, f.threshold, f.protocol, f.observer): f for f in found}
     sentences = {(f.id, f.rule, f.threshold): f.sentence for f in found}
     by_statement = []
@@ -251,15 +239,24 @@ def findings_section(found: Sequence[Finding]) -> Section:
         cells = []
         for key in keys:
             f = by.get((*statement, *key))
-            cells.append("" if f is None or f.value is None else f"{told[f.verdict]} {f.value:.3g}".strip())
+            cells.append("" if f is None or f.value is None else f"{_TOLD[f.verdict]} {f.value:.3g}".strip())
         by_statement.append((*statement, *cells, sentence))
     statements = Table(
         ("id", "statement: value", "threshold", *map(", ".join, keys), "the paper's sentence"),
         by_statement,
         wide=(1, 3 + len(keys)),
     )
-    details = Table(header, rows, "Every finding with its details", wide=(2, 5, 7, 8), folded=True)
-    return Section("Findings", text, statements, details)
+    return Section(
+        "Findings", text, statements, replace(details, caption="Every finding with its details", folded=True)
+    )
+
+
+_TOLD = {True: "true", False: "false", None: ""}
+_FINDING_COLUMNS: dict[str, Any] = {
+    "id": "id", "verdict": lambda f: _TOLD[f.verdict] or "-", "statement: value": "rule",
+    "value": lambda f: None if f.value is None else f"{f.value:.4g}", "threshold": "threshold",
+    "protocol": "protocol", "observer": "observer", "detail": "detail", "the paper's sentence": "sentence",
+}  # fmt: skip
 
 
 def waterfall_section(
@@ -291,7 +288,10 @@ def waterfall_section(
     return Section(
         "From published to corrected",
         "Departures of the authors' software are corrected one after the other, from top to bottom.",
-        Figure(waterfall_figure(labels, panels), "Mean error after each correction, by eye model."),
+        Figure(
+            rows_figure(labels, panels, "mean error (deg)", joined=True),
+            "Mean error after each correction, by eye model.",
+        ),
         table,
     )
 
@@ -299,19 +299,12 @@ def waterfall_section(
 def errata_section(departures: Sequence[Departure], faults: Sequence[Erratum]) -> Section:
     """List the departures of the software, and the misprints of the paper."""
     wide = (0, 1, 2, 3)
+    software = {"departure": "title", "the paper": "paper", "the authors' software": "software",
+                "corrected": "corrected"}  # fmt: skip
+    misprints = {name: name for name in ("where", "printed", "used", "effect")}
     return Section(
         "Errata",
         "This section lists where the authors' software departs from the paper, and the misprints of the paper.",
-        Table(
-            ("departure", "the paper", "the authors' software", "corrected"),
-            [(d.title, d.paper, d.software, d.corrected) for d in departures],
-            caption="Departures of the software",
-            wide=wide,
-        ),
-        Table(
-            ("where", "printed", "used", "effect"),
-            [(e.where, e.printed, e.used, e.effect) for e in faults],
-            caption="Misprints",
-            wide=wide,
-        ),
+        table_of(departures, software, "Departures of the software", wide=wide),
+        table_of(faults, misprints, "Misprints", wide=wide),
     )

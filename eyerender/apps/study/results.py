@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
+from ...base.errors import InputError
 from ...base.storage.files import csv_text, write_json, write_text
 from ...folders.imagefolder import versions
 from ...rig.rig import RigGeometry
@@ -55,6 +57,9 @@ class ModelResults:
         errors: errors (n,) deg, by (protocol, observer) and estimator.
         vectors: error vectors (n, 2) deg to the right and up (`error_vectors_deg`).
         seed_vectors: error vectors (s, n, 2) of s further exposures of images without noise, each with other noise.
+        done: results of the estimators, by (protocol, observer) and estimator.
+        waterfall: errors as departures are corrected one after the other.
+        more: what a study computes besides.
     """
 
     eye_model: str
@@ -63,6 +68,9 @@ class ModelResults:
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
     seed_vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+    done: dict[tuple[str, str], Any] = field(default_factory=dict)
+    waterfall: list[WaterfallStep] = field(default_factory=list)
+    more: dict[str, Any] = field(default_factory=dict)
 
 
 def over_seeds(found: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
@@ -87,6 +95,46 @@ class Finding:
     verdict: bool | None
     detail: str
     sentence: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        id: str,
+        key: tuple[str, str],
+        rule: str,
+        value: float,
+        threshold: str,
+        detail: str = "",
+        sentence: str = "",
+    ) -> Finding:
+        """Test a value against a threshold such as "< 0.01", ">= 2", "= 1" or "0.1 to 0.2"; "none" has no verdict.
+
+        >>> er.apps.Finding.of("S1", ("own", "analytic"), "largest error (deg)", 0.3, "< 0.5").verdict
+        True
+        """
+        verdict = None if threshold == "none" else holds(float(value), threshold)
+        return cls(id, *key, rule, float(value), threshold, verdict, detail, sentence)
+
+
+_COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "=": operator.eq}
+
+
+def holds(value: float, threshold: str) -> bool:
+    """Return whether a value meets a threshold; NaN meets none.
+
+    Raises:
+        InputError: the threshold is not of the form of `Finding.of`.
+    """
+    try:
+        if " to " in threshold:
+            low, high = map(float, threshold.split(" to "))
+            return low <= value <= high
+        sign, limit = threshold.split()
+        return bool(_COMPARE[sign](value, float(limit)))
+    except (ValueError, KeyError):
+        raise InputError(
+            f"must be such as '< 0.1', '= 1' or '0.1 to 0.2', not {threshold!r}", path="threshold"
+        ) from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,24 +190,19 @@ def known_mean(errors: Floats) -> float | None:
     return float(good.mean()) if len(good) else None
 
 
-def write_results(
-    folder: Path, study: str, rows: Sequence[Row], findings: Sequence[Finding], more: dict[str, Any]
-) -> dict[str, Any]:
-    """Write summary.json, findings.json and both as CSV; return the summary."""
-    summary = {
-        "schema": SUMMARY_SCHEMA,
-        "study": study,
-        "versions": versions(),
-        **more,
-        "rows": [asdict(row) for row in rows],
-    }
+def write_results(folder: Path, study: str, settings: Mapping[str, Any], report: Any) -> dict[str, Any]:
+    """Write summary.json, findings.json, both as CSV, and further tables of a `StudyReport`; return the summary."""
+    rows = [row if isinstance(row, Mapping) else asdict(row) for row in report.rows]
+    head = {"schema": SUMMARY_SCHEMA, "study": study, "versions": versions()}
+    summary = {**head, **settings, **report.more, "rows": rows}
     write_json(folder / "summary.json", summary)
-    write_json(
-        folder / "findings.json",
-        {"schema": FINDINGS_SCHEMA, "study": study, "findings": [asdict(finding) for finding in findings]},
-    )
-    write_text(folder / "summary.csv", table(Row, rows))
-    write_text(folder / "findings.csv", table(Finding, findings))
+    if not report.rows or isinstance(report.rows[0], Row):
+        found = [asdict(finding) for finding in report.findings]
+        write_json(folder / "findings.json", {"schema": FINDINGS_SCHEMA, "study": study, "findings": found})
+        write_text(folder / "summary.csv", table(Row, report.rows))
+        write_text(folder / "findings.csv", table(Finding, report.findings))
+    for name, (header, lines) in report.tables.items():
+        write_text(folder / name, csv_text(header, lines))
     return summary
 
 

@@ -10,30 +10,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...base.arrays import Bools, Floats, finite_or_none
 from ...base.progress import Progress
-from ...base.storage.files import csv_text, write_json, write_text
 from ...design.choice import SiteInformation, choose_lights, noise_of_some
 from ...design.crowd import coverage_of, covered, figures_of_people, gaze_of
 from ...design.noise import sensor_noise
 from ...design.people import GRID, LOST, Figures, RigPopulation, sites_seen
 from ...design.safety import eye_exposure
 from ...design.unknowns import Unknowns
-from ...folders.outfolder import staged
+from ...report.page import Page
 from ...scene import Scene
 from ...scene.people import Population
 from ...scene.spec import SceneSpec
+from . import rigs_page
 from .layouts import KnownLayout, known_layouts
-from .options import StudyOptions
-from .rigs_page import write_rigs_page
+from .study import Study, StudyPlan, StudyReport
 
-SCHEMA = "eyerender/study/1"
-PEOPLE = 100
 _BUYERS = 24
 _LOST_DEG = 60.0
 TRAITS = {
@@ -53,6 +49,7 @@ class RigResult:
     """Results for one layout: figures of people, their losses (p, 81), and rows with the effect of LEDs."""
 
     layout: KnownLayout
+    preset: str
     figures: Figures
     lost: Bools
     bought: Sequence[Mapping[str, Any]]
@@ -77,45 +74,58 @@ class RigResult:
         }  # fmt: skip
 
 
-def run_rigs(
-    output: str | Path, options: StudyOptions, *, people: int | None = None, progress: Progress | None = None
-) -> dict[str, Any]:
-    """Run the study and write summary.json, leds.csv, who.csv and report.html.
+class RigsStudy(Study):
+    """Six known rigs before a population."""
 
-    Args:
-        output: the folder.
-        options: workers and overwriting; no other option applies.
-        people: number of people.
-        progress: called with (people done, people in all, what).
+    title = "Six rigs and a population"
+    about = rigs_page.LEAD
+    eyes = ()
+    people = 100
+    observers = ("analytic",)
 
-    Raises:
-        InputError: the folder is not empty.
-    """
-    count = PEOPLE if people is None else people
-    with staged(output, overwrite=options.overwrite) as folder:
-        results = [_result(layout, count, options.workers, progress) for layout in known_layouts()]
-        traits = [traits_of(result.figures) for result in results]
-        rows = [result.to_mapping(own) for result, own in zip(results, traits, strict=True)]
-        data = {"schema": SCHEMA, "study": "rigs", "population": "adults", "note": "noise only", "rows": rows}
-        write_json(folder / "summary.json", data)
+    def parts(self, plan: StudyPlan, progress: Progress | None = None) -> list[RigResult]:
+        """Compute the results of each layout; the processes share the people."""
+        preset, workers = plan.people[0]["preset"], plan.options.workers
+        return [_result(layout, preset, len(plan.people), workers, progress) for layout in known_layouts()]
+
+    def report(self, parts: Sequence[RigResult], protocols: Sequence[str]) -> StudyReport:
+        """Compose summary, tables and page."""
+        preset = parts[0].preset
+        rows = [part.to_mapping(traits_of(part.figures, preset)) for part in parts]
         leds = [{"layout": row["layout"], **one} for row in rows for one in row["leds"]]
-        write_text(folder / "leds.csv", csv_text(list(leds[0]), (list(one.values()) for one in leds)))
-        who = (
+        who = [
             (row["layout"], name, third, lost)
             for row in rows
             for name, losses in row["lost_by_third"].items()
             for third, lost in zip(("low", "middle", "high"), losses, strict=True)
+        ]
+        maps = {part.layout.name: part.lost.mean(axis=0) for part in parts}
+        return StudyReport(
+            rows=rows,
+            more={"population": preset, "note": "noise only"},
+            tables={
+                "leds.csv": (list(leds[0]), [list(one.values()) for one in leds]),
+                "who.csv": (("layout", "trait", "third", "lost"), who),
+            },
+            page=Page(self.title, self.about, rigs_page.cards(rows), rigs_page.sections(rows, maps)),
         )
-        write_text(folder / "who.csv", csv_text(("layout", "trait", "third", "lost"), who))
-        write_rigs_page(folder / "report.html", data, {r.layout.name: r.lost.mean(axis=0) for r in results})
-    return data
+
+    def text(self, summary: Mapping[str, Any]) -> list[str]:
+        """Format one line per layout."""
+        lines = [f"{'layout':<18} {'lost':>7} {'2 glints':>9} {'U95E95 deg':>11}"]
+        for row in summary["rows"]:
+            noise = row["frame_to_frame_deg"]["U95E95"]
+            shown = "not seen" if noise is None else f"{noise:.4f}"
+            covered = row["coverage"]["outline_and_2_glints"]
+            lines.append(f"{row['layout']:<18} {100 * row['lost']:>5.1f} % {100 * covered:>7.1f} % {shown:>11}")
+        return lines
 
 
-def _result(layout: KnownLayout, people: int, workers: int | None, progress: Progress | None) -> RigResult:
+def _result(layout: KnownLayout, preset: str, people: int, workers: int | None, progress: Progress | None) -> RigResult:
     scene = Scene.of(SceneSpec.from_mapping(layout.scene))
     survey = RigPopulation(
         scene=layout.scene,
-        population=Population("adults").to_mapping(),
+        population=Population(preset).to_mapping(),
         slippage_mm=layout.slippage_mm,
         relief_mm=layout.relief_mm,
         unknowns=Unknowns.population(slippage_mm=max(3.0, layout.slippage_mm)).to_mapping(),
@@ -126,6 +136,7 @@ def _result(layout: KnownLayout, people: int, workers: int | None, progress: Pro
     place = scene.eye_position_mm("right")
     return RigResult(
         layout=layout,
+        preset=preset,
         figures=found,
         lost=~covered(found, needed),
         bought=bought(survey, scene, min(_BUYERS, people)),
@@ -178,10 +189,10 @@ def regions() -> dict[str, Bools]:
     return dict(zip(REGIONS, [*(part & ~ahead for part in parts), ahead], strict=True))
 
 
-def traits_of(found: Figures, seed: int = 0) -> dict[str, Floats]:
+def traits_of(found: Figures, preset: str = "adults", seed: int = 0) -> dict[str, Floats]:
     """Return traits (p,) of the people of figures."""
     last = int(found.subject.max()) + 1
-    numbers = Population("adults").numbers(last, seed)
+    numbers = Population(preset).numbers(last, seed)
     out = {}
     for name, keys in TRAITS.items():
         columns = [numbers[key] if numbers[key].ndim == 1 else numbers[key][:, 0] for key in keys]

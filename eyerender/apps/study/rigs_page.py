@@ -3,43 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...base.arrays import Floats
 from ...design.people import GRID, LOST
-from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
+from ...report.page import Card, Figure, Section, Table, degrees_text
 from ...report.style import figure, heat_map, log_scale, svg
 
+LEAD = (
+    "Six known layouts before the same people. A person is lost in a direction if less than 60 % of the pupil's "
+    "outline is visible, or fewer than two glints are (one, where there is one LED).",
+    "Headsets sit 1.5 mm off per axis and 3 mm in eye relief; before remote trackers the head moves by 15 mm per "
+    "axis (standard deviations, chosen). Everything follows from ray optics; noise is that of the sensor alone. "
+    "Lashes and frames are not considered.",
+)
 
-def write_rigs_page(path: Path, data: Mapping[str, Any], maps: Mapping[str, Floats]) -> None:
-    """Write the page; `maps` holds the share of people lost in each of the 81 directions."""
-    rows = data["rows"]
-    best = min(rows, key=lambda row: row["lost"])
-    worst = max(rows, key=lambda row: row["lost"])
-    cards = [
+
+def cards(rows: Any) -> list[Card]:
+    """Return the best and the worst layout."""
+    best, worst = (choose(rows, key=lambda row: row["lost"]) for choose in (min, max))
+    return [
         Card(f"{100 * best['lost']:.1f} %", f"of people and directions are lost with {best['layout']}, the fewest"),
         Card(f"{100 * worst['lost']:.1f} %", f"with {worst['layout']}, the most"),
         Card(str(rows[0]["people"]), "people, 81 directions each"),
     ]
-    lead = [
-        "Six known layouts before the same people. A person is lost in a direction if less than 60 % of the pupil's "
-        "outline is visible, or fewer than two glints are (one, where there is one LED).",
-        "Headsets sit 1.5 mm off per axis and 3 mm in eye relief; before remote trackers the head moves by 15 mm per "
-        "axis (standard deviations, chosen). Everything follows from ray optics; noise is that of the sensor alone. "
-        "Lashes and frames are not considered.",
-    ]
-    sections = (
+
+
+def sections(rows: Any, maps: Mapping[str, Floats]) -> list[Section]:
+    """Return the sections; `maps` holds the share of people lost in each of the 81 directions."""
+    return [
         Section("Which layout loses whom?", _overview(rows), _regions(rows), _why(rows)),
         Section("Where?", *[Figure(_map(maps[row["layout"]]), f"{row['layout']}: share of people who are lost, over "
                 "azimuth (to the left) and elevation of the optic axis.", True) for row in rows]),
         Section("Who?", _WHO, _who(rows)),
         Section("What does each LED buy?", _LEDS, Figure(_buys(rows), "Noise of the optic axis (median) with the "
                 "best LEDs of each number."), _led_table(rows)),
-    )  # fmt: skip
-    write_page(path, Page("Six rigs and a population", lead, cards, sections))
+    ]  # fmt: skip
 
 
 _WHO = (

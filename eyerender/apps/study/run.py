@@ -3,49 +3,49 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 from ...base.errors import EyerenderError, InputError
-from ...base.processes import mapper, usable_cpus
-from ...base.progress import Progress, Say, notify
-from ...base.storage.files import csv_text, read_json, write_json, write_text
+from ...base.progress import Progress, Say
+from ...base.references import is_reference, load_reference
+from ...base.storage.files import read_json, write_json
 from ...base.storage.lock import writer_lock
 from ...eye.catalogue import load_eye
 from ...folders.outfolder import clear, refuse_non_empty
 from ...report.page import write_page
-from ...scene import Scene
-from . import blignaut, guestrin, head_mounted, summarise
-from .conditions import DRAWN_PEOPLE, conditions_part, people_part
-from .head_mounted import head_mounted_part
+from ...scene.people import Population
 from .images import make_images
-from .literature import MODELS, VARIANTS
 from .observing import ObserverKind, Observing
 from .options import StudyOptions
-from .replicate import blignaut_part, facing, guestrin_part, scenes_of
 from .results import write_results
+from .study import Study, StudyJob, StudyPlan
 
-STUDIES = ("guestrin2006", "blignaut2014", "observers", "conditions")
+STUDIES: Final = MappingProxyType(
+    {
+        "guestrin2006": "guestrin_study:GuestrinStudy",
+        "blignaut2014": "blignaut_study:BlignautStudy",
+        "observers": "head_mounted:ObserversStudy",
+        "conditions": "conditions_study:ConditionsStudy",
+        "rigs": "rigs:RigsStudy",
+    }
+)
+"""Name of a study -> its class in this package."""
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT, IMAGES = "study.json", "report.html", "images"
-_SUMMARISE: dict[str, Callable[..., summarise.Results]] = {
-    "guestrin2006": summarise.guestrin_results,
-    "blignaut2014": summarise.blignaut_results,
-    "observers": summarise.observers_results,
-    "conditions": summarise.conditions_results,
-}
+PEOPLE_SEED = 0
 
 
 def run_study(
-    name: str,
+    study: str | type[Study],
     folder: str | Path,
     options: StudyOptions = StudyOptions(workers=1),
     *,
-    eyes: Sequence[str] = MODELS,
+    eyes: Sequence[str] | None = None,
     progress: Progress | None = None,
     say: Say | None = None,
     **changes: Any,
@@ -55,12 +55,14 @@ def run_study(
     A study may be run again in its own folder. Its images are a dataset in `images/`: an interrupted run continues, and
     a finished one is reused.
 
+    >>> er.apps.run_study("conditions", "out/conditions", eyes=["E2"])  # doctest: +SKIP
+
     Args:
-        name: guestrin2006, blignaut2014, observers (both observers on the head-mounted rig), or conditions (beyond the
-            paper; analytic).
+        study: guestrin2006, blignaut2014, observers, conditions or rigs; or your own: a subclass of `Study`, or its
+            name as `module:Class`.
         folder: the folder for the results.
         options: protocol, observer, workers and the like.
-        eyes: eye models (catalogue names or files). With E5 and `published`, its two published variants are included.
+        eyes: eye models (catalogue names or files; default: those of the study, or none if people are asked for).
         progress: called with (done, total, note).
         say: called with a message for each problem that does not end the run.
         changes: fields of `StudyOptions` by name, instead of those of `options`.
@@ -72,51 +74,118 @@ def run_study(
         InputError: the study, an eye or an option is unknown, or the folder holds something else.
         BackendError: no backend can render the images.
     """
-    if name not in STUDIES:
-        raise InputError(f"{name!r} is not a study; choose from {', '.join(STUDIES)}")
-    if not eyes or len(set(eyes)) != len(eyes):
+    name = study if isinstance(study, str) else f"{study.__module__}:{study.__qualname__}"
+    chosen = load_study(name) if isinstance(study, str) else study()
+    plan = planned(chosen, name, replace(options, **changes), eyes)
+    settings = _settings(name, plan)
+    folder = Path(folder)
+    with _claimed(folder, settings, plan.options.overwrite):
+        start = time.monotonic()
+        plan = _with_images(chosen, name, plan, folder / IMAGES, progress, say)
+        report = chosen.report(chosen.parts(plan, progress), plan.protocols)
+        seconds = round(time.monotonic() - start, 2)
+        summary = write_results(folder, name, {"settings": settings, "seconds": seconds}, report)
+        write_page(folder / REPORT, report.page)
+        return summary
+
+
+def load_study(name: str) -> Study:
+    """Create a study from its name, or a user's own from `module:Class`.
+
+    Raises:
+        InputError: there is no such study.
+    """
+    if name not in STUDIES and not is_reference(name):
+        known = ", ".join(STUDIES)
+        raise InputError(f"{name!r} is not a study; choose from {known}, or give your own as module:Class")
+    kind = load_reference(f"{__package__}.{STUDIES[name]}" if name in STUDIES else name, source=name)
+    if not (isinstance(kind, type) and issubclass(kind, Study)):
+        raise InputError("is not a subclass of eyerender.apps.Study", source=name)
+    return kind()
+
+
+def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] | None) -> StudyPlan:
+    """Check the options of a run; return its plan, without images.
+
+    Raises:
+        InputError: an eye model or an option does not suit the study.
+    """
+    count = _people_asked(study, name, options)
+    if eyes is None:
+        eyes = () if count and not study.people else study.eyes
+    elif not study.eyes:
+        raise InputError(f"has no meaning for the study {name!r}, whose eyes are those of people", source="--eyes")
+    elif not eyes or len(set(eyes)) != len(eyes):
         raise InputError("name each eye once", source="--eyes")
     for eye in eyes:
         load_eye(eye)
-    options = replace(options, **changes)
-    observer = options.observer or ("both" if name == "observers" else "analytic")
-    if name == "conditions" and observer != "analytic":
-        raise InputError("the study 'conditions' supports the analytic observer only", source="--observer")
-    if name == "observers" and observer != "both":
-        raise InputError("the study 'observers' compares both observers", source="--observer")
-    settings: dict[str, Any] = {"study": name, "protocol": options.protocol, "observer": observer, "eyes": list(eyes)}
-    if observer != "analytic":
+    observer = options.observer or study.observers[0]
+    if observer not in study.observers:
+        known = " or ".join(map(repr, study.observers))
+        raise InputError(f"the study {name!r} needs {known}, not {observer!r}", source="--observer")
+    if count and observer != "analytic":
+        raise InputError("people are observed by ray optics only", source="--observer")
+    preset = Population(options.population or study.population or "adults").preset
+    protocols = (options.protocol,) if options.protocol in study.protocols else tuple(study.protocols)
+    return StudyPlan(
+        options=options,
+        eyes=tuple(eyes),
+        people=tuple({"preset": preset, "seed": PEOPLE_SEED, "subject": k} for k in range(count)),
+        protocols=protocols,
+        observer=observer,
+        observings=tuple(Observing(kind) for kind in _kinds(observer, options.noise)),
+    )
+
+
+def _people_asked(study: Study, name: str, options: StudyOptions) -> int:
+    """Return the number of people of a run."""
+    asked = options.people is not None or options.population is not None
+    if asked and study.population is None:
+        raise InputError(f"the study {name!r} draws no people", source="--people")
+    count = study.people if options.people is None else options.people
+    if asked and not count:
+        raise InputError("give the number of people, too: --people N", source="--population")
+    return count
+
+
+def _settings(name: str, plan: StudyPlan) -> dict[str, Any]:
+    """Return the settings that the study's files state."""
+    options = plan.options
+    settings: dict[str, Any] = {
+        "study": name,
+        "protocol": options.protocol,
+        "observer": plan.observer,
+        "eyes": list(plan.eyes),
+    }
+    if plan.people:
+        settings |= {"population": plan.people[0]["preset"], "people": len(plan.people)}
+    if plan.observer != "analytic":
         settings |= {"spp": options.spp, "sensor_noise": options.noise, "noise_seeds": options.noise_seeds}
-    settings |= _exposure(options.auto_exposure, observer)
-    folder = Path(folder)
-    protocols = ("published", "corrected") if options.protocol == "both" else (options.protocol,)
-    kinds = _kinds(observer, options.noise)
-    with _claimed(folder, settings, options.overwrite):
-        start = time.monotonic()
-        images = None
-        if any(kind != "analytic" for kind in kinds):
-            scenes = _image_scenes(name, eyes, protocols, kinds, options.spp)
-            images = make_images(name, scenes, folder / IMAGES, options, _noted(progress), say)
-        # The noise term, which needs images with and without noise, is the mean of several exposures.
-        seeds = {"image-noiseless": options.noise_seeds} if "image" in kinds else {}
-        observers = [Observing(k, None if k == "analytic" else images, seeds.get(k, 0)) for k in kinds]
-        # One job compares all observers, or has one of them.
-        together_or_alone = [tuple(observers)] if name == "observers" else [(one,) for one in observers]
-        jobs = [
-            (observings, eye, told)
-            for observings in together_or_alone
-            for eye, told in _models(name, eyes, protocols, observings)
-        ]
-        count = options.workers or usable_cpus()
-        notes = [f"{eye}, {' and '.join(o.kind for o in observings)}" for observings, eye, _ in jobs]
-        parts = _collected(partial(_job, name), jobs, notes, count, progress)
-        rows, found, more, page = _SUMMARISE[name](parts, protocols)
-        more = {"settings": settings, "seconds": round(time.monotonic() - start, 2), **more}
-        summary = write_results(folder, name, rows, found, more)
-        if "waterfall" in more:
-            write_text(folder / "waterfall.csv", _waterfall_csv(more["waterfall"]))
-        write_page(folder / REPORT, page)
-        return summary
+    return settings | _exposure(options.auto_exposure, plan.observer)
+
+
+def _with_images(
+    study: Study, name: str, plan: StudyPlan, folder: Path, progress: Progress | None, say: Say | None
+) -> StudyPlan:
+    """Make the images that a plan needs, and give them to its observers."""
+    kinds = [one.kind for one in plan.observings]
+    if kinds == ["analytic"]:
+        return plan
+    scenes = []
+    for eye in plan.eyes:
+        own = [s for p in plan.protocols for s in study.scenes(StudyJob(who=eye), p).values()]
+        scenes += [
+            shot.scene for scene in own for one in plan.observings
+            for shot in one.shots(scene, facing=study.facing, spp=plan.options.spp)
+        ]  # fmt: skip
+    images = make_images(name, scenes, folder, plan.options, _noted(progress), say)
+    # The noise term, which needs images with and without noise, is the mean of several exposures.
+    seeds = {"image-noiseless": plan.options.noise_seeds} if "image" in kinds else {}
+    observings = tuple(
+        one if one.kind == "analytic" else replace(one, images=images, noise_seeds=seeds.get(one.kind, 0))
+        for one in plan.observings
+    )
+    return replace(plan, observings=observings)
 
 
 def _exposure(level: float | None, observer: str) -> dict[str, float]:
@@ -145,53 +214,6 @@ def _noted(progress: Progress | None) -> Progress | None:
     if progress is None:
         return None
     return lambda done, total, note: progress(done, total, note.replace("samples", "samples of images", 1))
-
-
-def _image_scenes(
-    name: str, eyes: Sequence[str], protocols: Sequence[str], kinds: Sequence[ObserverKind], spp: int | None
-) -> list[Scene]:
-    """Return the scenes of all images that a study needs."""
-    if name == "observers":
-        scenes, turned = [head_mounted.scene(eye) for eye in eyes], False
-    else:
-        module = guestrin if name == "guestrin2006" else blignaut
-        scenes, turned = scenes_of(module, eyes, protocols), facing(module)
-    shots = [s for scene in scenes for k in kinds for s in Observing(k).shots(scene, facing=turned, spp=spp)]
-    return [shot.scene for shot in shots]
-
-
-def _models(
-    name: str, eyes: Sequence[str], protocols: Sequence[str], observings: Sequence[Observing]
-) -> list[tuple[str, tuple[str, ...]]]:
-    """Return eye models with their protocols; the published variants of E5 have their own names."""
-    out = [(eye, tuple(protocols)) for eye in eyes]
-    if name == "guestrin2006" and observings[0].kind == "analytic" and "E5" in eyes and "published" in protocols:
-        out += [(v, ("published",)) for v in VARIANTS if v not in eyes]
-    if name == "conditions":
-        out.append((DRAWN_PEOPLE, tuple(protocols)))
-    return out
-
-
-def _job(name: str, job: tuple[tuple[Observing, ...], str, tuple[str, ...]]) -> Any:
-    observings, eye, protocols = job
-    if name == "conditions":
-        return people_part() if eye == DRAWN_PEOPLE else conditions_part(eye)
-    if name == "observers":
-        return head_mounted_part(eye, observings)
-    return (guestrin_part if name == "guestrin2006" else blignaut_part)(eye, protocols, observings[0])
-
-
-def _collected(
-    job: Callable[[Any], Any], items: list[Any], names: Sequence[str], workers: int, progress: Progress | None
-) -> list[Any]:
-    """Run a job on each item and collect the results in order."""
-    out = []
-    notify(progress, 0, len(items), "eye models")
-    with mapper(min(workers, len(items))) as mapped:
-        for k, part in enumerate(mapped(job, items)):
-            out.append(part)
-            notify(progress, k + 1, len(items), f"eye models, {names[k]}")
-    return out
 
 
 @contextmanager
@@ -230,12 +252,3 @@ def _claimed(folder: Path, settings: dict[str, Any], overwrite: bool) -> Iterato
                 (folder / MARKER).unlink()
             if created and not any(folder.iterdir()):
                 folder.rmdir()
-
-
-def _waterfall_csv(steps: Sequence[dict[str, Any]]) -> str:
-    rows = [
-        (step["eye_model"], step["departure"], measure, value, step["alone"][measure])
-        for step in steps
-        for measure, value in step["errors"].items()
-    ]
-    return csv_text(("eye_model", "departure", "measure", "cumulative_deg", "alone_deg"), rows)

@@ -1,4 +1,4 @@
-"""Findings, summary and report values of the study of conditions."""
+"""The study of conditions: its findings, summary and report; the errors are those of `conditions`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
-from ...report.page import Card, Content, Figure, Page, Section, Table, number
+from ...report.page import Card, Content, Figure, Section, table_of
 from . import conditions as c
-from .conditions import ConditionsPart, PeoplePart
-from .figures import lines_figure, map_figure, sensitivity_figure
+from .conditions import ConditionsPart
+from .figures import lines_figure, map_figure, rows_figure
+from .page_parts import Apart, rows_section
 from .results import Finding
+from .study import Study, StudyJob
 
 _WHO = {
     "model-based": "Guestrin & Eizenman (2006), nine targets, index fixed",
@@ -25,96 +27,99 @@ _D2 = "largest mean error over head positions within 40 mm (deg)"
 _D3 = "largest change of the mean error over pupils of 2 to 8 mm (deg)"
 
 
-def findings(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> list[Finding]:
-    """Return the effects of the conditions as findings without a published claim."""
-    out = []
+class ConditionsStudy(Study):
+    """Errors of two trackers over conditions beyond the paper."""
 
-    def add(name: str, rule: str, value: float, detail: str) -> None:
-        out.append(Finding(name, "corrected", "analytic", rule, float(value), "none", None, detail))
-
-    for tracker in c.TRACKERS:
-        for part in parts:
-            base = next(r.mean_deg for r in part.rows if r.variant == f"{tracker}, as calibrated") or np.nan
-            detail = f"as calibrated {base:.4f} deg"
-            add("D1", f"{part.eye_model}, {tracker}: {_D1}", np.nanmax(part.screen_maps[tracker]), detail)
-            add("D2", f"{part.eye_model}, {tracker}: {_D2}", np.nanmax(part.head_maps[tracker]), detail)
-    curves = [(p.eye_model, name, values) for p in parts for name, values in p.diameters.items()]
-    curves += [
-        (f"{c.PEOPLE_PRESET} {subject}", name, values)
-        for p in people
-        for subject, by_name in p.diameters.items()
-        for name, values in by_name.items()
-    ]
-    for who, name, values in curves:
-        base = values[c.DIAMETERS_MM.index(c.CALIBRATED_MM)]
-        change = np.nanmax(np.abs(np.array(values) - base))
-        add(
-            "D3",
-            f"{who}, {name}: {_D3}",
-            change,
-            f"{base:.4f} deg at 4 mm, {values[0]:.4f} at 2, {values[-1]:.4f} at 8",
-        )
-    return out
-
-
-def more(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart] = ()) -> dict[str, Any]:
-    """Return the content of the summary besides its rows."""
-    return {
-        "trackers": _WHO,
-        "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
-        "head_positions_mm": list(c.HEAD_MM),
-        "pupil_diameters_mm": list(c.DIAMETERS_MM),
-        "models": [
-            {
-                "eye_model": part.eye_model,
-                "screen_maps_deg": {k: _listed(v) for k, v in part.screen_maps.items()},
-                "head_maps_deg": {k: _listed(v) for k, v in part.head_maps.items()},
-                "sensitivity": part.sensitivity,
-                "precision": part.precision,
-                "diameters_deg": part.diameters,
-            }
-            for part in parts
-        ],
-        "people": {
-            "preset": c.PEOPLE_PRESET,
-            "seed": c.PEOPLE_SEED,
-            "diameters_deg": {str(subject): found for part in people for subject, found in part.diameters.items()},
-        },
-    }
-
-
-def page(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Page:
-    """Compose the report."""
-    who = "; ".join(f"{t}: {_WHO[t]}" for t in c.TRACKERS)
-    lead = [
+    title = "Beyond the paper: conditions"
+    about = (
         "This study shows how the errors of two trackers depend on the target, the head, the pupil and the eye. All "
-        f"features are analytic. {who}. Eye models: {', '.join(p.eye_model for p in parts)}."
-    ]
-    cards = [
-        Card(
-            " ".join(f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in parts),
-            f"largest mean error (deg) over heads within 40 mm, {t}",
-        )
-        for t in c.TRACKERS
-    ]
-    sections = [
-        Section(
-            "Over the screen",
-            "The maps show the error at each target for the central head position and a 4 mm pupil.",
-            *(_screen_map(t, parts) for t in c.TRACKERS),
-        ),
-        Section(
-            "Over head positions",
-            "The maps show the mean error over 3 x 3 targets after the head has moved from the calibration "
-            "position (0, 0).",
-            *(_head_map(t, parts) for t in c.TRACKERS),
-        ),
-        Section("Over the pupil diameter", *_diameters(parts, people)),
-        _sensitivity(parts),
-        _precision(parts),
-        _values(parts, people, found),
-    ]
-    return Page("Beyond the paper: conditions", lead, cards, sections)
+        f"features are analytic. {'; '.join(f'{t}: {_WHO[t]}' for t in c.TRACKERS)}.",
+    )
+    people = c.PEOPLE
+    observers = ("analytic",)
+
+    def part(self, job: StudyJob) -> ConditionsPart:
+        """Compute all conditions of one eye model, or the pupil sizes of one person."""
+        return c.conditions_part(job.who) if job.person is None else c.person_part(job.person)
+
+    def findings(self, parts: Sequence[ConditionsPart]) -> list[Finding]:
+        """Return the effects of the conditions as findings without a published claim."""
+        out = []
+
+        def add(name: str, rule: str, value: float, detail: str) -> None:
+            out.append(Finding(name, "corrected", "analytic", rule, float(value), "none", None, detail))
+
+        for tracker in c.TRACKERS:
+            for part in _models(parts):
+                base = next(r.mean_deg for r in part.rows if r.variant == f"{tracker}, as calibrated") or np.nan
+                detail = f"as calibrated {base:.4f} deg"
+                add("D1", f"{part.eye_model}, {tracker}: {_D1}", np.nanmax(part.screen_maps[tracker]), detail)
+                add("D2", f"{part.eye_model}, {tracker}: {_D2}", np.nanmax(part.head_maps[tracker]), detail)
+        for part in parts:
+            who = part.eye_model if part.person is None else f"{part.person['preset']} {part.person['subject']}"
+            for name, values in part.diameters.items():
+                base = values[c.DIAMETERS_MM.index(c.CALIBRATED_MM)]
+                change = np.nanmax(np.abs(np.array(values) - base))
+                detail = f"{base:.4f} deg at 4 mm, {values[0]:.4f} at 2, {values[-1]:.4f} at 8"
+                add("D3", f"{who}, {name}: {_D3}", change, detail)
+        return out
+
+    def more(self, parts: Sequence[ConditionsPart], protocols: Sequence[str]) -> dict[str, Any]:
+        """Return maps, curves, sensitivity and precision."""
+        people = [p for p in parts if p.person is not None]
+        return {
+            "trackers": _WHO,
+            "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
+            "head_positions_mm": list(c.HEAD_MM),
+            "pupil_diameters_mm": list(c.DIAMETERS_MM),
+            "models": [
+                {
+                    "eye_model": part.eye_model,
+                    "screen_maps_deg": {k: _listed(v) for k, v in part.screen_maps.items()},
+                    "head_maps_deg": {k: _listed(v) for k, v in part.head_maps.items()},
+                    "sensitivity": part.sensitivity,
+                    "precision": part.precision,
+                    "diameters_deg": part.diameters,
+                }
+                for part in _models(parts)
+            ],
+            "people": {
+                "preset": people[0].person["preset"] if people and people[0].person else None,
+                "seed": people[0].person["seed"] if people and people[0].person else None,
+                "diameters_deg": {str(p.person["subject"]): p.diameters for p in people if p.person},
+            },
+        }
+
+    def cards(self, parts: Sequence[ConditionsPart], apart: Apart) -> Any:
+        """Return the largest mean errors over head positions."""
+        text = "largest mean error (deg) over heads within 40 mm"
+        by = {t: [f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in _models(parts)] for t in c.TRACKERS}
+        return [Card(" ".join(values), f"{text}, {t}") for t, values in by.items()], None
+
+    def sections(self, parts: Sequence[ConditionsPart], found: Sequence[Finding], table: Any) -> list[Section | None]:
+        """Return maps, curves, sensitivity and precision."""
+        models = _models(parts)
+        return [
+            Section(
+                "Over the screen",
+                "The maps show the error at each target for the central head position and a 4 mm pupil.",
+                *(_screen_map(t, models) for t in c.TRACKERS),
+            ),
+            Section(
+                "Over head positions",
+                "The maps show the mean error over 3 x 3 targets after the head has moved from the calibration "
+                "position (0, 0).",
+                *(_head_map(t, models) for t in c.TRACKERS),
+            ),
+            Section("Over the pupil diameter", *_diameters(models, [p for p in parts if p.person is not None])),
+            _sensitivity(models),
+            _precision(models),
+            rows_section(parts),
+        ]
+
+
+def _models(parts: Sequence[ConditionsPart]) -> list[ConditionsPart]:
+    return [part for part in parts if part.person is None]
 
 
 def _screen_map(tracker: str, parts: Sequence[ConditionsPart]) -> Figure:
@@ -135,7 +140,7 @@ def _head_map(tracker: str, parts: Sequence[ConditionsPart]) -> Figure:
     )
 
 
-def _diameters(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart]) -> list[Content]:
+def _diameters(parts: Sequence[ConditionsPart], people: Sequence[ConditionsPart]) -> list[Content]:
     models = {p.eye_model: p.diameters for p in parts}
     out: list[Content] = [
         "The trackers are calibrated with a 4 mm pupil and tested with other diameters. The pupils widen about a fixed "
@@ -145,7 +150,7 @@ def _diameters(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart]) ->
         *(Figure(_over_diameters(t, models), f"{t}: mean error by pupil diameter and eye model.") for t in c.TRACKERS),
     ]
     if people:
-        drawn = {f"person {k}": found for p in people for k, found in p.diameters.items()}
+        drawn = {p.eye_model: p.diameters for p in people}
         out.append("The eyes of a drawn person differ, and so do the shifts of their pupils.")
         for t in c.TRACKERS:
             out.append(Figure(_over_diameters(t, drawn), f"{t}: mean error of drawn people by pupil diameter."))
@@ -167,28 +172,19 @@ def _sensitivity(parts: Sequence[ConditionsPart]) -> Section:
 
 
 def _precision(parts: Sequence[ConditionsPart]) -> Section:
-    rows = [(t, p.eye_model, *(number(p.precision[t][k]) for k in c.QUALITY)) for t in c.TRACKERS for p in parts]
+    rows = [{"tracker": t, "eye": p.eye_model, **p.precision[t]} for t in c.TRACKERS for p in parts]
     return Section(
         "Accuracy and precision",
         f"Pupil centres and glints have Gaussian noise of {c.NOISE_PX:g} px in x and y, with {c.SAMPLES} samples per "
         f"fixation and seed {c.SEED}. Accuracy is the angle from the target to the mean estimate. RMS-S2S is the root "
         "mean square angle between successive samples. SD is the standard deviation about the mean. The table gives "
         "means over all fixations, in degrees.",
-        Table(("tracker", "eye model", "accuracy", "RMS-S2S", "SD"), rows),
-    )
-
-
-def _values(parts: Sequence[ConditionsPart], people: Sequence[PeoplePart], found: Sequence[Finding]) -> Section:
-    values = [(f.id, f.rule, number(f.value), f.detail) for f in found]
-    rows = [
-        (r.eye_model, r.variant or "", number(r.mean_deg), number(r.sd_deg), str(r.n), str(r.missing))
-        for r in [*(r for p in parts for r in p.rows), *(r for p in people for r in p.rows)]
-    ]
-    header = ("eye model", "condition", "mean (deg)", "SD (deg)", "n", "missing")
-    return Section(
-        "Values",
-        Table(("id", "statement", "value", "detail"), values, wide=(1,)),
-        Table(header, rows, "Every condition", folded=True),
+        table_of(
+            rows,
+            dict(
+                zip(("tracker", "eye model", "accuracy", "RMS-S2S", "SD"), ("tracker", "eye", *c.QUALITY), strict=True)
+            ),
+        ),
     )
 
 
@@ -213,7 +209,7 @@ def _sensitivity_figure(parts: Sequence[ConditionsPart]) -> str:
     changes = {
         t: {p.eye_model: [steps.get((t, p.eye_model, n), np.nan) for n in names] for p in parts} for t in c.TRACKERS
     }
-    return sensitivity_figure(names, changes, "change of the mean error (thousandths of a degree)")
+    return rows_figure(names, changes, "change of the mean error (thousandths of a degree)")
 
 
 def _screen_axes(tracker: str, values: Floats) -> tuple[Floats, Floats]:

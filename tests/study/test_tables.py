@@ -1,0 +1,60 @@
+"""The tables of docs/studies.md: they are those of the stored results, and a run gives the stored results."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import pytest
+
+from eyerender.apps.study import literature as lit
+from eyerender.apps.study.run import run_study
+from tests.support.paths import ROOT
+
+spec = importlib.util.spec_from_file_location("study_tables", ROOT / "scripts/study_tables.py")
+script = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(script)
+
+
+def test_the_page_has_the_tables_of_the_stored_results():
+    data = json.loads(script.DATA.read_text(encoding="utf-8"))
+    page = script.PAGE.read_text(encoding="utf-8")
+    assert script.page_with(page, script.tables(data)) == page, "run scripts/study_tables.py"
+
+
+def test_the_page_lists_every_sentence_with_its_rules():
+    page = script.PAGE.read_text(encoding="utf-8")
+    for rule in lit.RULES.values():
+        sentence = lit.SENTENCES.get(rule["sentence"])
+        if sentence:
+            (line,) = [line for line in page.splitlines() if f"| {sentence} |" in line]
+            assert rule["finding"] in line.rsplit("|", 2)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", script.KNOWN)
+def test_a_run_gives_the_stored_results(name, tmp_path):
+    """To four digits; those after them differ between libraries of linear algebra."""
+    run_study(name, tmp_path / "out")
+    stored = json.loads(script.DATA.read_text(encoding="utf-8"))[name]
+    found = script.numbers_of(tmp_path / "out")[name]
+    if "means" in stored:
+        stored["means"] = {key: by for key, by in stored["means"].items() if key.endswith(", analytic")}
+    assert_same(found, stored)
+
+
+def assert_same(found, stored):
+    """Compare nested values; p-values of paired tests span many orders of magnitude, so these are compared as such."""
+    if isinstance(stored, dict):
+        assert found.keys() == stored.keys()
+        for key in stored:
+            assert_same(found[key], stored[key])
+    elif isinstance(stored, list):
+        assert len(found) == len(stored)
+        for pair in zip(found, stored, strict=True):
+            assert_same(*pair)
+    elif isinstance(stored, float):
+        assert found == pytest.approx(stored, rel=1e-3, abs=1e-6)
+    else:
+        assert found == stored
