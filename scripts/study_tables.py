@@ -132,6 +132,8 @@ def _findings(found: list[dict[str, Any]]) -> str:
     rows: dict[tuple[str, str, str], dict[str, str]] = {}
     for f in found:
         value = "-" if f["value"] is None else f"{f['value']:.3g}"
+        if value == f["threshold"].split()[-1]:  # a verdict that three digits do not explain
+            value = f"{f['value']:.5g}"
         rows.setdefault((f["id"], f["rule"], f["threshold"]), {})[f["protocol"]] = f"{told[f['verdict']]}: {value}"
     body = [[id, rule, threshold, *(by.get(p, "") for p in READINGS)] for (id, rule, threshold), by in rows.items()]
     return table(["finding", "statement: value", "threshold", *READINGS], body)
@@ -153,10 +155,10 @@ def _untested() -> str:
 def page_with(text: str, found: Mapping[str, str]) -> str:
     """Replace the tables of the page."""
     for name, body in found.items():
-        pattern = rf"(<!-- table {re.escape(name)} -->\n).*?(\n<!-- end -->)"
+        pattern = rf"(<!-- table {re.escape(name)} -->\n).*?(<!-- end -->)"
         if not re.search(pattern, text, re.S):
             raise SystemExit(f"{PAGE}: there is no table {name}")
-        text = re.sub(pattern, lambda m, body=body: m[1] + body + m[2], text, flags=re.S)
+        text = re.sub(pattern, lambda m, body=body: f"{m[1]}{body}\n{m[2]}", text, flags=re.S)
     return text
 
 

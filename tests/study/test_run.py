@@ -130,6 +130,11 @@ class Own(er.apps.Study):
 class Broken(Own):
     def findings(self, parts):
         return [er.apps.Finding.of("S1", ("own", "analytic"), "anything", 1.0, "about 1")]
+
+
+class Mistaken(Own):
+    def findings(self, parts):
+        return [parts[0].done["own", "analytic"]["R9"]]
 """
 
 
@@ -173,6 +178,7 @@ BAD = [
     (["study", "own:Own", "-o", "out", "--population", "adults"], 2, "--people N"),
     (["study", "own:Own", "-o", "out", "--people", "2", "--observer", "both"], 2, "ray optics only"),
     (["study", "own:Broken", "-o", "out", "--eyes", "E1"], 2, "must be such as '< 0.1'"),
+    (["study", "own:Mistaken", "-o", "out", "--eyes", "E1"], 2, "own:Mistaken: KeyError: 'R9'"),
     (["study", "guestrin2006", "-o", "out", "--noise", "some"], 2, "--noise"),
     (["study", "guestrin2006", "-o", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
     (["study", "guestrin2006", "-o", "out", "--spp", "0"], 2, "--spp: must be >= 1"),

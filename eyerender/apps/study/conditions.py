@@ -83,7 +83,6 @@ class ConditionsPart(ModelResults):
     Maps (rows, columns) by tracker are NaN where there is no estimate.
     """
 
-    person: Mapping[str, Any] | None = None
     screen_maps: dict[str, Floats] = field(default_factory=dict)
     head_maps: dict[str, Floats] = field(default_factory=dict)
     diameters: dict[str, list[float]] = field(default_factory=dict)

@@ -51,7 +51,8 @@ class ModelResults:
     """Results of a study for one eye model.
 
     Attributes:
-        eye_model: the eye model.
+        eye_model: the eye model, or the name of a drawn person.
+        person: the choice of a drawn person: preset, seed, subject.
         rows: mean errors.
         seen: rig and observations, by (protocol, observer).
         errors: errors (n,) deg, by (protocol, observer) and estimator.
@@ -63,6 +64,7 @@ class ModelResults:
     """
 
     eye_model: str
+    person: Mapping[str, Any] | None = None
     rows: list[Row] = field(default_factory=list)
     seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)

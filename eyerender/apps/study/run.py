@@ -81,8 +81,9 @@ def run_study(
     folder = Path(folder)
     with _claimed(folder, settings, plan.options.overwrite):
         start = time.monotonic()
-        plan = _with_images(chosen, name, plan, folder / IMAGES, progress, say)
-        report = chosen.report(chosen.parts(plan, progress), plan.protocols)
+        with mistakes_of(name):
+            plan = _with_images(chosen, name, plan, folder / IMAGES, progress, say)
+            report = chosen.report(chosen.parts(plan, progress), plan.protocols)
         seconds = round(time.monotonic() - start, 2)
         summary = write_results(folder, name, {"settings": settings, "seconds": seconds}, report)
         write_page(folder / REPORT, report.page)
@@ -101,7 +102,25 @@ def load_study(name: str) -> Study:
     kind = load_reference(f"{__package__}.{STUDIES[name]}" if name in STUDIES else name, source=name)
     if not (isinstance(kind, type) and issubclass(kind, Study)):
         raise InputError("is not a subclass of eyerender.apps.Study", source=name)
-    return kind()
+    with mistakes_of(name):
+        return kind()
+
+
+@contextmanager
+def mistakes_of(name: str) -> Iterator[None]:
+    """Turn what a user's own study raises into one line; errors of this package's studies are left alone.
+
+    Raises:
+        InputError: the block raised another exception than an error of this package.
+    """
+    try:
+        yield
+    except EyerenderError:
+        raise
+    except Exception as error:
+        if name in STUDIES:
+            raise
+        raise InputError(f"{type(error).__name__}: {error}", source=name) from error
 
 
 def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] | None) -> StudyPlan:

@@ -46,7 +46,17 @@ from .page_parts import (
     rows_section,
     waterfall_section,
 )
-from .results import Departure, Erratum, Finding, ModelResults, Row, WaterfallStep, mean_row, over_seeds
+from .results import (
+    Departure,
+    Erratum,
+    Finding,
+    ModelResults,
+    Row,
+    WaterfallStep,
+    known_mean,
+    mean_row,
+    over_seeds,
+)
 
 _MOST_LINES = 8  # in one panel of a figure
 _PUPIL_MM = 4.0  # diameter of a person's pupil where the scene states none
@@ -160,7 +170,7 @@ class Study:
 
     def part(self, job: StudyJob) -> Any:
         """Observe and estimate for one job."""
-        out, observing = ModelResults(eye_model=job.who), job.observing
+        out, observing = ModelResults(eye_model=job.who, person=job.person), job.observing
         for protocol in job.protocols:
             key = protocol, observing.kind
             scenes = self.scenes(job, protocol)
@@ -196,7 +206,7 @@ class Study:
             fitted = estimator.fit(learnt, scenes[first].rig)
             for condition, own in seen.items():
                 gaze = fitted.predict(own, scenes[condition].rig)
-                out[f"{name}, {condition}" if condition else name] = errors_of(own, gaze)
+                out[_named(name, condition)] = errors_of(own, gaze)
         return out
 
     def rows(self, done: Mapping[str, Any], seen: Mapping[str, Observations], keys: Mapping[str, Any]) -> Sequence[Row]:
@@ -220,8 +230,8 @@ class Study:
     def cards(self, parts: Sequence[Any], apart: Apart) -> tuple[Sequence[Card], Any]:
         """Return the page's first numbers, and a table that replaces cards where these would be too many."""
         out = []
-        for (name, observer), by in list(_grouped(parts).items())[:4]:
-            medians = [f"{np.nanmedian([one.get(c, np.nan) for one in by.values()]):.2f}" for c in self.conditions]
+        for (name, observer), by in list(self._means(parts).items())[:4]:
+            medians = [f"{np.nanmedian([one[c] for one in by.values()]):.2f}" for c in self.conditions]
             about = " / ".join(filter(None, self.conditions))
             out.append(Card(" / ".join(medians), f"median error (deg) of {len(by)}, {name}, {observer}: {about}"))
         return out, None
@@ -232,8 +242,8 @@ class Study:
         if len(names) < 2:
             return [rows_section(parts)]
         panels: dict[str, dict[str, list[float]]] = {}
-        for (name, observer), by in _grouped(parts).items():
-            lines = {who: [one.get(c, np.nan) for c in names] for who, one in by.items()}
+        for (name, observer), by in self._means(parts).items():
+            lines = {who: [one[c] for c in names] for who, one in by.items()}
             if len(lines) > _MOST_LINES:
                 shares = {"5 %": 5, "median": 50, "95 %": 95}
                 lines = {k: np.nanpercentile(list(lines.values()), v, axis=0).tolist() for k, v in shares.items()}
@@ -242,10 +252,21 @@ class Study:
         caption = f"Mean error by condition; of more than {_MOST_LINES} people or models, percentiles."
         return [Section("Over the conditions", Figure(drawn, caption)), rows_section(parts)]
 
+    def _means(self, parts: Sequence[ModelResults]) -> dict[tuple[str, str], dict[str, dict[str, float]]]:
+        """Collect mean errors (deg): (estimator, observer) -> eye model or person -> condition."""
+        out: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
+        for part in parts:
+            for (_, observer), done in part.done.items():
+                for name in self.estimators:
+                    means = {c: known_mean(done[_named(name, c)].error_deg) for c in self.conditions}
+                    known = {c: np.nan if mean is None else mean for c, mean in means.items()}
+                    out.setdefault((name, observer), {})[part.eye_model] = known
+        return out
+
     def report(self, parts: Sequence[Any], protocols: Sequence[str]) -> StudyReport:
         """Compose findings, summary and page."""
         apart = compare_observers(parts)
-        made_of = budgets([part for part in parts if part.eye_model not in VARIANTS])
+        made_of = budgets([p for p in parts if p.person is None and p.eye_model not in VARIANTS])
         found, faults = self.findings(parts), self.errata(parts)
         steps: list[WaterfallStep] = [step for part in parts for step in part.waterfall]
         cards, table = self.cards(parts, apart)
@@ -293,6 +314,10 @@ def _part(study: Study, job: StudyJob) -> Any:
     return study.part(job)
 
 
+def _named(estimator: str, condition: str) -> str:
+    return f"{estimator}, {condition}" if condition else estimator
+
+
 def name_of(person: Mapping[str, Any]) -> str:
     """Return the name of a drawn person in rows."""
     return f"{person['preset']} {person['seed']}/{person['subject']}"
@@ -327,13 +352,3 @@ def errors_of(seen: Observations, gaze: GazePoints) -> EstimatorErrors:
         error_deg=angular_error_deg(gaze.point_mm, seen.index.target_mm, place),
         vector_deg=error_vectors_deg(gaze.point_mm - place, seen.index.target_mm - place),
     )
-
-
-def _grouped(parts: Sequence[ModelResults]) -> dict[tuple[str, str], dict[str, dict[str, float]]]:
-    """Collect mean errors (deg): (estimator, observer) -> eye model or person -> condition."""
-    out: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
-    for row in (row for part in parts for row in part.rows):
-        name, _, condition = (row.variant or "").partition(", ")
-        mean = np.nan if row.mean_deg is None else row.mean_deg
-        out.setdefault((name, row.observer), {}).setdefault(row.eye_model, {})[condition] = mean
-    return out
