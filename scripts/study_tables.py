@@ -158,7 +158,8 @@ def page_with(text: str, found: Mapping[str, str]) -> str:
         pattern = rf"(<!-- table {re.escape(name)} -->\n).*?(<!-- end -->)"
         if not re.search(pattern, text, re.S):
             raise SystemExit(f"{PAGE}: there is no table {name}")
-        text = re.sub(pattern, lambda m, body=body: f"{m[1]}{body}\n{m[2]}", text, flags=re.S)
+        before, after = re.split(pattern, text, maxsplit=1, flags=re.S)[0::3]
+        text = f"{before}<!-- table {name} -->\n{body}\n<!-- end -->{after}"
     return text
 
 

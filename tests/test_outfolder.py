@@ -163,7 +163,8 @@ def test_what_the_rooms_write_can_be_replaced(tmp_path):
     shards = [f"{SHARDS}/00000/{name}" for name in (LINES, DONE)]
     whole = [LOG, assemble.FAILURES, assemble.CARD, croissant.CROISSANT, "run.json", "metadata.jsonl"]
     dataset = [*kinds, *shards, *whole, f"{assemble.FAILURES}.part", f".{assemble.CARD}.0123abcd.part"]
-    results = ["summary.json", "summary.csv", "findings.json", "findings.csv", "waterfall.csv", study.REPORT]
+    results = ["summary.json", "summary.csv", "findings.json", "findings.csv", study.REPORT]
+    results += ["waterfall.csv", "leds.csv", "who.csv"]
     for name in [*dataset, *(f"images/{name}" for name in dataset), *results, study.MARKER, f"images/{LOCK}"]:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")

@@ -52,7 +52,7 @@ _FILES = re.compile(
     r"(dataset|run|croissant)\.json|(metadata|failures|log)\.jsonl|README\.md|report\.html|"
     rf"({_KINDS})/([0-9]+/)?[^/]+\.(png|exr|npz)|"
     r"shards/[0-9]+/(lines\.jsonl|lines\.jsonl\.gz|images\.tar|done\.json)|index\.npy)"
-    r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|results)\.csv|\.eyerender\.json"
+    r"|(study|summary|findings|results|times)\.json|(summary|findings|waterfall|leds|who|results)\.csv|\.eyerender\.json"
 )
 # Names of files that are being written, with their final names.
 _PARTS = re.compile(r"(?P<folder>(?:.*/)?)(?:\.(?P<hidden>[^/]+)\.[0-9a-f]{8}|(?P<plain>[^/]+))\.part")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...analytic.observer import trace
-from ...report.page import Figure, Section, Table, number
+from ...report.page import Card, Figure, Section, Table, number
 from ...scene import Scene
 from ...scene.observation import Observations
 from . import blignaut, featureclouds, findings
@@ -17,7 +17,7 @@ from .featureclouds import Cloud
 from .figures import clouds_figure, lines_figure
 from .findings import SETS
 from .guestrin_study import departures_of
-from .page_parts import ABOUT_READINGS, Apart, overview, rows_section
+from .page_parts import ABOUT_READINGS, Apart, cards_of, rows_section
 from .results import Erratum, Finding, ModelResults, Row
 from .study import Study, StudyJob
 from .waterfall import waterfall
@@ -100,15 +100,15 @@ class BlignautStudy(Study):
         """Return the misprints."""
         return lit.errata(blignaut.SCENE)
 
-    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> Any:
+    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> list[Card]:
         """Return the errors of the best functions."""
         cells = {
             key: {m: f"{v[0]:.2f}/{v[1]:.2f}/{v[-1]:.3f}" for m, v in by_model.items()}
             for key, by_model in _best_by_key(parts).items()
         }
-        return overview(cells, "error of the best function with C5/C9/C135 in degrees")
+        return cards_of(cells, "error of the best function with C5/C9/C135 in degrees")
 
-    def sections(self, parts: Sequence[ModelResults], found: Sequence[Finding], table: Any) -> list[Section | None]:
+    def sections(self, parts: Sequence[ModelResults]) -> list[Section]:
         """Return feature clouds, best functions, and every function."""
         own = {", ".join(key): by_model for key, by_model in _best_by_key(parts).items()}
         best_rows = _best_rows(parts)
@@ -126,7 +126,6 @@ class BlignautStudy(Study):
                     "Error of the best regression function by calibration set and eye model, and of the best function "
                     "of the experiment (26 people).",
                 ),
-                table,
                 Table(
                     ("protocol", "observer", "variant", "eye model", *SETS),
                     best_rows,

@@ -90,13 +90,13 @@ class ConditionsStudy(Study):
             },
         }
 
-    def cards(self, parts: Sequence[ConditionsPart], apart: Apart) -> Any:
+    def cards(self, parts: Sequence[ConditionsPart], apart: Apart) -> list[Card]:
         """Return the largest mean errors over head positions."""
         text = "largest mean error (deg) over heads within 40 mm"
         by = {t: [f"{p.eye_model}\u00a0{np.nanmax(p.head_maps[t]):.2f}" for p in _models(parts)] for t in c.TRACKERS}
-        return [Card(" ".join(values), f"{text}, {t}") for t, values in by.items()], None
+        return [Card(" ".join(values), f"{text}, {t}") for t, values in by.items()]
 
-    def sections(self, parts: Sequence[ConditionsPart], found: Sequence[Finding], table: Any) -> list[Section | None]:
+    def sections(self, parts: Sequence[ConditionsPart]) -> list[Section]:
         """Return maps, curves, sensitivity and precision."""
         models = _models(parts)
         return [

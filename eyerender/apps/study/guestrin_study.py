@@ -12,13 +12,13 @@ from ...analytic.observer import trace
 from ...base.arrays import Floats
 from ...base.errors import InputError
 from ...gaze.budget import mean_interval
-from ...report.page import Figure, Section, table_of
+from ...report.page import Card, Figure, Section, table_of
 from ...scene import Scene
 from ...scene.observation import Observations
 from . import findings, guestrin
 from . import literature as lit
 from .figures import heads_figure
-from .page_parts import ABOUT_READINGS, Apart, overview, rows_section
+from .page_parts import ABOUT_READINGS, Apart, cards_of, rows_section
 from .results import Erratum, Finding, ModelResults, Row
 from .study import Study, StudyJob, StudyPlan
 from .waterfall import waterfall
@@ -114,16 +114,16 @@ class GuestrinStudy(Study):
             "misprints": _misprints(parts),
         }
 
-    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> Any:
+    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> list[Card]:
         """Return the means by eye model; the published variants of E5 are in the section's text and table."""
         cells = {}
         for key in _keys(parts):
             means = _means(parts, key)[0]
             some = {m: v for m, v in means.items() if m not in lit.VARIANTS or len(means) == 1}
             cells[key] = {m: f"{v['H1']:.2f}/{v['H2']:.2f}" for m, v in some.items()}
-        return overview(cells, "mean error at H1/H2 in degrees")
+        return cards_of(cells, "mean error at H1/H2 in degrees")
 
-    def sections(self, parts: Sequence[ModelResults], found: Sequence[Finding], table: Any) -> list[Section | None]:
+    def sections(self, parts: Sequence[ModelResults]) -> list[Section]:
         """Return errors, tests and calibrations."""
         tests = _tests(parts)
         paper = {(m, h): v for m, both in lit.PAPER_GUESTRIN.items() for h, v in zip(guestrin.HEADS, both, strict=True)}
@@ -134,7 +134,6 @@ class GuestrinStudy(Study):
                 "means and the four participants of Guestrin & Eizenman. The estimator is calibrated on the nine "
                 "targets at H1.",
                 _heads_figure(parts),
-                table,
             ),
             Section(
                 "Compared with the experiment",

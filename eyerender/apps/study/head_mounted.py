@@ -99,14 +99,14 @@ class ObserversStudy(Study):
             "tested_on": int((~calibration_rows()).sum()),
         }
 
-    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> Any:
+    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> list[Card]:
         """Return a card per observer with the distances of the pupil's centre by eye model."""
         by: dict[str, list[str]] = {}
         for f in apart[0]:
             if f.feature == "pupil centre":
                 by.setdefault(f.observer, []).append(f"{f.eye_model}\u00a0{number(f.median_distance_px, 3)}")
         text = "median distance of the pupil centre from ray optics (px)"
-        return [Card(" ".join(values), f"{text}, {observer}") for observer, values in by.items()], None
+        return [Card(" ".join(values), f"{text}, {observer}") for observer, values in by.items()]
 
 
 def directions_deg() -> Floats:

@@ -33,18 +33,12 @@ _NETS = (
 )
 
 
-def overview(cells: Mapping[tuple[str, str], Mapping[str, str]], what: str) -> tuple[list[Card], Table | None]:
-    """Return a page's first values, by (protocol, observer) and eye model: cards, or a table for more than four."""
-    models = list(dict.fromkeys(m for by_model in cells.values() for m in by_model))
-    if len(cells) <= 4:
-        cards = [
-            Card(" ".join(f"{m}\u00a0{v}" for m, v in by_model.items()), f"{what}, {', '.join(key)}")
-            for key, by_model in cells.items()
-        ]
-        return cards, None
-    rows = [(*key, *(by_model.get(m, "-") for m in models)) for key, by_model in cells.items()]
-    caption = f"{what[0].upper()}{what[1:]}"
-    return [], Table(("protocol", "observer", *models), rows, caption=caption)
+def cards_of(cells: Mapping[tuple[str, str], Mapping[str, str]], what: str) -> list[Card]:
+    """Return a card for each (protocol, observer), with a value for each eye model."""
+    return [
+        Card(" ".join(f"{m}\u00a0{v}" for m, v in by_model.items()), f"{what}, {', '.join(key)}")
+        for key, by_model in cells.items()
+    ]
 
 
 def budget_section(made_of: Sequence[Budget], shown: Sequence[str], who: str) -> Section | None:

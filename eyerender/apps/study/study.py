@@ -227,16 +227,16 @@ class Study:
         """Return what the summary holds besides rows, error budget and observers."""
         return {}
 
-    def cards(self, parts: Sequence[Any], apart: Apart) -> tuple[Sequence[Card], Any]:
-        """Return the page's first numbers, and a table that replaces cards where these would be too many."""
+    def cards(self, parts: Sequence[Any], apart: Apart) -> Sequence[Card]:
+        """Return the page's first numbers; `apart` compares the observers."""
         out = []
         for (name, observer), by in list(self._means(parts).items())[:4]:
             medians = [f"{np.nanmedian([one[c] for one in by.values()]):.2f}" for c in self.conditions]
             about = " / ".join(filter(None, self.conditions))
             out.append(Card(" / ".join(medians), f"median error (deg) of {len(by)}, {name}, {observer}: {about}"))
-        return out, None
+        return out
 
-    def sections(self, parts: Sequence[Any], found: Sequence[Finding], table: Any) -> Sequence[Section | None]:
+    def sections(self, parts: Sequence[Any]) -> Sequence[Section]:
         """Return the page's own sections; by default the error over the conditions."""
         names = list(self.conditions)
         if len(names) < 2:
@@ -269,11 +269,10 @@ class Study:
         made_of = budgets([p for p in parts if p.person is None and p.eye_model not in VARIANTS])
         found, faults = self.findings(parts), self.errata(parts)
         steps: list[WaterfallStep] = [step for part in parts for step in part.waterfall]
-        cards, table = self.cards(parts, apart)
         shown = tuple(self.shown) or tuple(dict.fromkeys(b.estimator for b in made_of))[:4]
         sections = [
             budget_section(made_of, shown, self.method),
-            *self.sections(parts, found, table),
+            *self.sections(parts),
             observers_section(apart, shown),
             findings_section(found) if found else None,
             waterfall_section(steps, self.departures, self.measures),
@@ -294,7 +293,7 @@ class Study:
             findings=found,
             more=more,
             tables={"waterfall.csv": (header, lines)} if self.departures else {},
-            page=Page(self.title, self.about, cards, sections),
+            page=Page(self.title, self.about, self.cards(parts, apart), sections),
         )
 
     def text(self, summary: Mapping[str, Any]) -> list[str]:
