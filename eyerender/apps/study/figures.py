@@ -170,6 +170,9 @@ def lines_figure(
                 ax.set_ylim(bottom=0)
             else:
                 log_scale(ax.yaxis)
+                marks = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
+                ax.set_yticks(marks, [f"{mark:g}" for mark in marks])
+                ax.minorticks_off()
             if ticks is not None:
                 ax.set_xticks(x, ticks)
             ax.set(title=name, xlabel=xlabel, ylabel=ylabel)
