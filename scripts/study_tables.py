@@ -4,8 +4,9 @@
     study_tables.py [FOLDER ...]
 
 Each folder is the result of a study (guestrin2006, blignaut2014, conditions). Its numbers go into
-docs/data/studies.json, where those of other studies and observers stay. Then every table between `<!-- table NAME -->`
-and `<!-- end -->` in docs/studies.md is written from that file. Without folders, only the page is written.
+docs/data/studies/results.json, where those of other studies and observers stay. Then every table between
+`<!-- table NAME -->` and `<!-- end -->` in docs/studies.md is written from that file. Without folders, only the page is
+written.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from typing import Any
 from eyerender.apps.study import literature as lit
 
 ROOT = Path(__file__).parents[1]
-DATA, PAGE = ROOT / "docs/data/studies.json", ROOT / "docs/studies.md"
-UNTESTED = ROOT / "docs/data/untested_sentences.csv"
+DATA, PAGE = ROOT / "docs/data/studies/results.json", ROOT / "docs/studies.md"
+UNTESTED = ROOT / "docs/data/studies/untested_sentences.csv"
 MODELS = lit.MODELS
 READINGS = ("published", "corrected")
 HEADS, SETS, LISTED = ("H1", "H2"), tuple(lit.CALIBRATION_SETS), ("C5", "C9", "C135")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -99,6 +101,8 @@ def load_study(name: str) -> Study:
     if name not in STUDIES and not is_reference(name):
         known = ", ".join(STUDIES)
         raise InputError(f"{name!r} is not a study; choose from {known}, or give your own as module:Class")
+    if name not in STUDIES and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # workers start in the folder in which Python was started
     kind = load_reference(f"{__package__}.{STUDIES[name]}" if name in STUDIES else name, source=name)
     if not (isinstance(kind, type) and issubclass(kind, Study)):
         raise InputError("is not a subclass of eyerender.apps.Study", source=name)
