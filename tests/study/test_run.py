@@ -158,6 +158,11 @@ def test_a_study_of_ones_own(tmp_path, monkeypatch, capsys):
     (found,) = json.loads((tmp_path / "out" / "findings.json").read_text())["findings"]
     assert (found["verdict"], found["value"]) == (True, rows["E2", "R3, 8 mm"] - rows["E2", "R3, 4 mm"])
     assert "Over the conditions" in (tmp_path / "out" / "report.html").read_text()
+    # People alone, in place of the eye models; one after the other here.
+    assert run(["study", "own:Own", "-o", "people", "--people", "1", "--workers", "1", "--json", "-"]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    assert alone["rows"] == [row for row in summary["rows"] if row["eye_model"] == "adults 0/0"]
+    assert (alone["settings"]["eyes"], alone["settings"]["people"]) == ([], 1)
 
 
 @pytest.mark.parametrize(("name", "words"), [("Broken", "threshold: must be such as"), ("Mistaken", "KeyError: 'R9'")])

@@ -89,6 +89,8 @@ def budgets(parts: Sequence[ModelResults]) -> list[Budget]:
     errors = _by_key(parts, "errors")
     vectors, seeds = _by_key(parts, "vectors"), _by_key(parts, "seed_vectors")
     models = list(dict.fromkeys(part.eye_model for part in parts))
+    if not models:
+        return []
     reference = "E1" if "E1" in models else models[0]
     out = []
     for protocol, name, model in dict.fromkeys(key[:3] for key in errors):

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -83,7 +83,7 @@ def run_study(
     folder = Path(folder)
     with _claimed(folder, settings, plan.options.overwrite):
         start = time.monotonic()
-        with mistakes_of(name):
+        with mistakes_of(name) if isinstance(study, str) else nullcontext():
             plan = _with_images(chosen, name, plan, folder / IMAGES, progress, say)
             report = chosen.report(chosen.parts(plan, progress), plan.protocols)
         seconds = round(time.monotonic() - start, 2)
