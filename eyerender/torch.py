@@ -12,19 +12,33 @@ Both datasets yield each image as a mapping with the requested parts:
 | `lens_reflection_mask` | int64 (h, w): 1 where a spectacle lens mirrors more light than comes from behind it |
 | `instance_mask` | int64 (h, w): as `mask`, with 5 skin, 6 upper lid, 7 lower lid, 8 lashes, 9 brow, 10 caruncle |
 | `depth`, `normals`, `iris_coordinates` | float32 (1, h, w), (3, h, w), (2, h, w): arrays of geometry, nan: none |
-| `glints` | float32 (lights, 3): x, y in px of the image, and 1 visible or 0 hidden; nan where there is none |
-| `lids` | float32 (2, 17, 2): landmarks of upper and lower lid in px, from the temple to the nose; nan for a bare eye |
-| `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad; or nan |
-| `gaze` | float32 (3,): unit vector of the line of sight in the camera's frame, out of the eye; nan without an eye |
-| `camera` | a mapping: `index`, `K` (3, 3) for px of the image, `R` (3, 3), `t_mm` (3,), `distortion`, `mirrored` |
-| `line` | the whole line of metadata, a dict |
+| `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad |
+| `visible_pupil`, `visible_iris` | float32 (5,): ellipse with the second moments of the visible pixels |
+| `visible_fraction` | float32 (2,): visible share of the pupil and of the iris |
+| `pupil_mm` | float32 (2,): diameter of the entrance pupil and of the anatomical stop |
+| `glints` | float32 (lights, 3), row k for lamp k of the rig: x, y in px of the image, 1 visible or 0 hidden |
+| `lids` | float32 (2, 17, 2): landmarks of upper and lower lid in px, from the temple to the nose |
+| `lid_opening` | float32 (2,): opening of the lids in mm, and as a share of the person's at rest |
+| `gaze`, `optic_axis` | float32 (3,): unit vectors out of the eye in the camera's frame; `gaze` is the line of sight |
+| `gaze_rig`, `optic_axis_rig` | float32 (3,): the same in the rig's frame: the world's axes, turned with the rig |
+| `gaze_deg`, `optic_axis_deg` | float32 (2,): azimuth (to the subject's left) and elevation (up) in the rig's frame |
+| `centres_mm`, `centres_rig_mm` | float32 (3, 3): centres of globe, cornea and pupil in these two frames |
+| `eye` | int64: 0 right, 1 left |
+| `person` | float32 (n,): numbers of the person and this eye, in the order of `person_names()` |
+| `camera` | a mapping: `index`, `K` for px of the image, `R`, `t_mm`, `distortion` (8,), `fisheye`, `mirrored` |
+| `line` | the whole line of metadata, a dict; it is that of the image before any change |
+
+Numbers that are unknown are nan. `valid` is a mapping from each label among the parts to bool tensors: one for an
+ellipse, a vector or `eye`, one per lamp, landmark, point or number of others. Labels of the pupil and of the gaze are
+not valid while under a tenth of the pupil shows. Glints and landmarks are valid in the picture alone.
 
 Pictures of any bit depth become shares of the full scale, so folders of different sensors can be joined; with `size`,
 those of different cameras, too. With `encoding="stored"`, the default, they are the codes that the camera stored, as in
-a recorded picture; `linear` undoes the camera's gamma. `distortion` of a camera is k1, k2, p1, p2, k3, with k4, k5, k6
-for a rational model, or k1, k2, k3, k4, p1, p2 of a fisheye; where `mirrored`, u runs the other way about the principal
-point. Every mapping also has `sample` and `subject`, the numbers of the sample and of its subject. Folders that
-`render` wrote have the same labels, but no such numbers.
+a recorded picture; `linear` undoes the camera's gamma. `distortion` of a camera is k1, k2, p1, p2, k3, k4, k5, k6
+(zeros where a lens has fewer), or k1, k2, k3, k4, p1, p2, nan, nan of a fisheye; where `mirrored`, u runs the other way
+about the principal point. Every mapping also has `sample` and `subject`, the numbers of the sample and of its subject.
+Folders that `render` wrote have the same labels, but no such numbers. With `mirror_left` or `augment`, `mirrored` says
+whether the picture and its labels are those of the mirrored scene.
 """
 
 from __future__ import annotations
@@ -41,14 +55,15 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from .backends.choose import BackendChoice
-from .base.errors import WRONG, InputError
+from .base.errors import InputError
 from .base.processes import spawning, usable_cpus
 from .dataset.plan import Plan
-from .dataset.realise import frames_of
+from .dataset.realise import frames_of, realise
 from .dataset.spec import DatasetSpec, GeometryKind
+from .dataset.training.augment import Augmentation
+from .dataset.training.item import PARTS, PICTURES, TrainingItem, person_names
+from .dataset.training.prepare import Preparation, lamps_vary
 from .folders.imagefolder import KINDS, ImageFolder
-from .region.mesh import LID_MARKS
-from .rig.camera import PinholeCamera
 
 if TYPE_CHECKING:
     from .dataset.maker import Maker
@@ -56,23 +71,12 @@ if TYPE_CHECKING:
 Parts = Mapping[str, Any]
 Transform = Callable[[dict[str, Any]], Any]
 
-# Part -> kind of picture of a dataset.
-_PICTURES = {
-    "image": "images",
-    "noiseless": "noiseless",
-    "mask": "masks",
-    "amodal_mask": "amodal_masks",
-    "highlight_mask": "highlights",
-    "lens_reflection_mask": "lens_reflections",
-    "instance_mask": "instances",
-    "depth": "depth",
-    "normals": "normals",
-    "iris_coordinates": "iris_coordinates",
-}
-_ARRAYS = ("depth", "normals", "iris_coordinates")
-PARTS = (*_PICTURES, "glints", "lids", "pupil", "iris", "gaze", "camera", "line")
-_STATE = ("start", "batch_size", "lanes", "shuffle")  # settings that must be equal when a stream resumes
+_STATE = ("start", "batch_size", "lanes", "shuffle", "reuse")  # settings that must be equal when a stream resumes
 _MIXED = 4  # lanes of each worker where images are mixed
+_LOOKED_AT = 16  # samples whose rigs are counted where rigs are drawn
+
+
+__all__ = ["PARTS", "Augment", "FolderDataset", "StreamDataset", "collate", "person_names", "place"]
 
 
 def collate(items: Sequence[Parts]) -> dict[str, Any]:
@@ -98,11 +102,37 @@ def _joined(items: Sequence[Parts]) -> dict[str, Any]:
         if isinstance(first, torch.Tensor):
             same = len({value.shape for value in values}) == 1
             batch[key] = torch.stack(values) if same else values
-        elif key == "camera":
+        elif key in ("camera", "valid"):
             batch[key] = _joined(values)
         else:
             batch[key] = torch.tensor(values) if isinstance(first, int | float) else values
     return batch
+
+
+class Augment(Augmentation):
+    """Random changes of pictures with all their labels; give it to a dataset as `augment`.
+
+    Called with a mapping of pictures and masks of your own, (1, h, w) and (h, w), it returns the changed mapping, and
+    draws from PyTorch's generator. The fields are those of `eyerender.dataset.training.augment.Augmentation`.
+    """
+
+    def __call__(self, item: Parts, size: tuple[int, int] | None = None) -> dict[str, Any]:
+        """Change pictures of an item of your own, to a size (width, height).
+
+        Raises:
+            InputError: the item holds other parts than pictures; give `augment` to the dataset instead.
+        """
+        pictures = {part: value for part, value in item.items() if part in PICTURES}
+        if len(pictures) < len(item):
+            reason = f"cannot be changed here; give 'augment' to the dataset ({', '.join(item.keys() - pictures)})"
+            raise InputError(reason, path="item")
+        own = {part: np.moveaxis(v.numpy(), 0, -1) if v.ndim == 3 else v.numpy() for part, v in pictures.items()}
+        parts = {part: v[..., 0] if v.shape[2:] == (1,) else v for part, v in own.items()}
+        masks = {part: v.astype(np.uint8) for part, v in parts.items() if part.endswith("mask")}
+        size_of = next(iter(parts.values())).shape[1::-1]
+        plain = TrainingItem(parts=parts | masks, size=size_of, shown=np.full(2, np.nan))
+        changed = self.changed(plain, size, _drawn())
+        return {part: _tensor(part, value) for part, value in changed.parts.items()}
 
 
 class FolderDataset(Dataset[Any]):
@@ -119,6 +149,10 @@ class FolderDataset(Dataset[Any]):
             with 0, or nan in arrays of geometry. Labels in px are scaled along, but not those in `line`.
         group: `sample` yields the images of one sample (all cameras and eyes of one instant) together: each part is
             stacked as in a batch, and a list where the sizes differ.
+        mirror_left: mirror pictures of left eyes, with all labels, as if they were right eyes.
+        augment: random changes, drawn anew for each item from PyTorch's generator, so that `torch.manual_seed`
+            determines them; the same for all images of a group.
+        lights: number of rows of `glints`, for rigs of different numbers of lamps; default: the folder's largest.
         transform: called with the mapping of each image or group; what it returns takes the mapping's place.
         encoding: `stored` gives the camera's codes, `linear` undoes its gamma; both as shares of the full scale.
 
@@ -135,13 +169,21 @@ class FolderDataset(Dataset[Any]):
         parts: Sequence[str] = ("image", "mask"),
         size: tuple[int, int] | None = None,
         group: Literal["sample"] | None = None,
+        mirror_left: bool = False,
+        augment: Augmentation | None = None,
+        lights: int | None = None,
         transform: Transform | None = None,
         encoding: Literal["stored", "linear"] = "stored",
     ) -> None:
         self.folder = ImageFolder.load(path)
-        self.parts = _checked(parts)
-        self.encoding = _checked_encoding(encoding)
-        self.size = _checked_size(size)
+        self.preparation = Preparation(
+            parts=tuple(parts),
+            encoding=encoding,
+            size=size,
+            lights=_lamps_of(self.folder) if lights is None and "glints" in parts else lights,
+            mirror_left=mirror_left,
+            augment=augment,
+        )
         self.transform = transform
         self.rows = np.arange(len(self.folder))
         if split is not None:
@@ -157,18 +199,19 @@ class FolderDataset(Dataset[Any]):
         return len(self.rows if self.groups is None else self.groups)
 
     def __getitem__(self, at: int) -> Any:
+        key = _drawn() if self.preparation.augment is not None else ()
         if self.groups is None:
-            item = self._image(int(self.rows[at]))
+            item = self._image(int(self.rows[at]), key)
         else:
-            images = [self._image(int(row)) for row in self.groups[at]]
+            images = [self._image(int(row), key) for row in self.groups[at]]
             item = {**_joined(images), **{key: images[0][key] for key in ("sample", "subject") if key in images[0]}}
         return item if self.transform is None else self.transform(item)
 
-    def _image(self, row: int) -> dict[str, Any]:
+    def _image(self, row: int, key: Sequence[int]) -> dict[str, Any]:
         entry = self.folder.entries[row]
         where = f"{entry.source}: line {entry.number}"
-        item = _item(self, entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
-        return item if self.size is None else _fitted(item, entry.window[2:], self.size)
+        item = self.preparation.read(entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
+        return _tensors(self.preparation.finish(item, key), self.preparation, entry.line)
 
 
 class StreamDataset(IterableDataset[Any]):
@@ -181,6 +224,10 @@ class StreamDataset(IterableDataset[Any]):
 
     With `shuffle`, a worker renders so many of its batches at a time and mixes their images, in an order that follows
     from the spec's seed. Each worker then has four lanes, so that batches show several subjects.
+
+    With `reuse`, each rendered image is yielded so many times: the batches that a worker has rendered are mixed and
+    changed by `augment` anew each time, while other workers render. Changes follow from the seed of `augment`, the
+    sample and the repetition, so the stream stays the same.
 
     `loader` makes the `DataLoader`. It always gives the same batches in the same order, and each sample once. With
     several ranks (processes that train together), rank r of n gets the batches r, r + n, ... of this order; one rank
@@ -201,10 +248,15 @@ class StreamDataset(IterableDataset[Any]):
         lanes: number of lanes, a multiple of the number of workers of all ranks; by default this number itself. The
             order of batches depends on it, so keep it when you resume with another number of workers.
         shuffle: number of batches whose images are mixed; 0 or 1: none. A resumed stream renders up to so many again.
+        reuse: how many times each image is yielded.
         split: only the samples of this split, such as "train"; None takes all.
         rank: rank of this process in distributed training; by default that of torch.distributed.
         ranks: number of ranks; by default that of torch.distributed.
         parts: keys of each item, from the table of this module.
+        size: as for `FolderDataset`.
+        mirror_left: as for `FolderDataset`.
+        augment: random changes of each image.
+        lights: as for `FolderDataset`; by default the largest number among some samples.
         transform: called with the mapping of each image; it must return a mapping.
         encoding: as for `FolderDataset`.
         backend: as for `eyerender.generate`.
@@ -225,18 +277,29 @@ class StreamDataset(IterableDataset[Any]):
         start: int = 0,
         lanes: int | None = None,
         shuffle: int = 0,
+        reuse: int = 1,
         split: str | None = None,
         rank: int | None = None,
         ranks: int | None = None,
         parts: Sequence[str] = ("image", "mask"),
+        size: tuple[int, int] | None = None,
+        mirror_left: bool = False,
+        augment: Augmentation | None = None,
+        lights: int | None = None,
         transform: Transform | None = None,
         encoding: Literal["stored", "linear"] = "stored",
         backend: BackendChoice = "auto",
         threads: int | None = None,
     ) -> None:
         self.plan = Plan.load(spec, eye=eye, seed=seed, count=count)
-        self.parts = _checked(parts)
-        self.encoding = _checked_encoding(encoding)
+        self.preparation = Preparation(
+            parts=tuple(parts),
+            encoding=encoding,
+            size=size,
+            lights=_lamps_in(self.plan) if lights is None and "glints" in parts else lights,
+            mirror_left=mirror_left,
+            augment=augment,
+        )
         self.samples = _samples(self.plan, split)
         together = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = (torch.distributed.get_rank() if together else 0) if rank is None else rank
@@ -246,6 +309,7 @@ class StreamDataset(IterableDataset[Any]):
             ("start", start, 0, math.inf),
             ("lanes", 1 if lanes is None else lanes, 1, math.inf),
             ("shuffle", shuffle, 0, math.inf),
+            ("reuse", reuse, 1, math.inf),
             ("ranks", self.ranks, 1, math.inf),
             ("rank", self.rank, 0, self.ranks - 1),
             ("threads", 1 if threads is None else threads, 1, math.inf),
@@ -253,13 +317,9 @@ class StreamDataset(IterableDataset[Any]):
             if not low <= value <= high:
                 allowed = f">= {low}" if high == math.inf else f"{low} to {high}"
                 raise InputError(f"must be {allowed}, not {value}", path=name)
-        pictures = self.plan.spec.labels.pictures
-        missing = [part for part in self.parts if part in _PICTURES and _PICTURES[part] not in pictures]
-        if missing:
-            kind = _PICTURES[missing[0]]
-            key = f"geometry: [{kind}]" if kind in get_args(GeometryKind) else f"{kind}: true"
-            raise InputError(f"the spec makes none; add 'labels: {{{key}}}'", path=missing[0])
-        self.batch_size, self.start, self.lanes, self.shuffle = batch_size, start, lanes, shuffle
+        _check_pictures(self.plan, parts)
+        self.batch_size, self.start, self.lanes = batch_size, start, lanes
+        self.shuffle, self.reuse = shuffle, reuse
         self.transform = transform
         self.backend, self.threads = backend, threads
         self.frames = frames_of(self.plan)
@@ -280,6 +340,16 @@ class StreamDataset(IterableDataset[Any]):
             options.setdefault("multiprocessing_context", spawning())
         return DataLoader(self, batch_size=None, num_workers=workers, **options)
 
+    def __len__(self) -> int:
+        """Return the number of batches of this rank, from `start` on; fewer come where samples are given up."""
+        own = len(range(self.rank, self._count, self.ranks)) * self.reuse
+        return max(own - len(range(self.rank, self.start, self.ranks)), 0)
+
+    @property
+    def _count(self) -> int:
+        """Number of batches that are rendered."""
+        return -(-len(self.samples) // self.batch_size)
+
     def __iter__(self) -> Iterator[Any]:
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
@@ -288,35 +358,38 @@ class StreamDataset(IterableDataset[Any]):
         lanes = self.lanes or turns * (_MIXED if self.shuffle > 1 else 1)
         if lanes % turns:
             raise InputError(f"must be a multiple of {turns}, the number of workers of all ranks", path="lanes")
-        count = -(-len(self.samples) // self.batch_size)
-        mixed: tuple[int, list[list[Any]]] = -1, []
-        for batch in range(self.start + turn, count, turns):
+        first = self.start + turn
+        own = range(first % turns, self._count, turns)  # batches that this worker renders
+        width = max(self.shuffle, 1)  # batches of a window
+        window, images = -1, []
+        for at in range(first // turns, len(own) * self.reuse):
+            batch = first % turns + turns * at
             if batch < begin:
                 continue
-            window, at = divmod(batch // turns, max(self.shuffle, 1))
-            if window != mixed[0]:
-                # The batches of a window are the same wherever iteration begins.
-                own = range(window * max(self.shuffle, 1) * turns + batch % turns, count, turns)
-                mixed = window, self._mixed(own[: max(self.shuffle, 1)], (count, lanes, workers))
-            items = mixed[1][at]
+            # The batches of a window are the same wherever iteration begins.
+            part, place_in = divmod(at, width * self.reuse)
+            rendered = own[part * width : (part + 1) * width]
+            if part != window:
+                window, images = part, [self._rendered(one, (lanes, workers)) for one in rendered]
+            items = self._mixed(rendered, images, *divmod(place_in, len(rendered)))
             self._next = batch + 1
             if items:
                 yield collate(items)
         self._next = None
 
-    def _mixed(self, batches: Sequence[int], sizes: tuple[int, int, int]) -> list[list[Any]]:
-        """Make the images of some batches, mixed; `sizes` are the numbers of batches, lanes and workers."""
-        count, lanes, workers = sizes
-        made = []
-        for batch in batches:
-            first = self.batch_size * place(batch, count, lanes)
-            own = self.samples[first : first + self.batch_size]
-            made.append([item for index in own for item in self._items(int(index), workers)])
-        if len(batches) < 2:
-            return made
-        images = [item for items in made for item in items]
-        order = np.random.default_rng([self.plan.spec.seed, batches[0]]).permutation(len(images))
-        return [[images[k] for k in part] for part in np.array_split(order, len(batches))]
+    def _mixed(self, batches: range, images: list[list[Any]], repetition: int, at: int) -> list[Any]:
+        """Return batch number `at` of a window whose images are mixed, in one of its repetitions."""
+        chosen = images[at]
+        if len(batches) > 1:
+            every = [image for batch in images for image in batch]
+            seed = [self.plan.spec.seed, batches[0], *([repetition] if repetition else [])]
+            order = np.random.default_rng(seed).permutation(len(every))
+            chosen = [every[k] for k in np.array_split(order, len(batches))[at]]
+        items = (
+            _tensors(self.preparation.finish(item, (*own, repetition)), self.preparation, line)
+            for item, line, own in chosen
+        )
+        return [item if self.transform is None else self.transform(item) for item in items]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the stream: `next` is the number of the batch after the last one yielded."""
@@ -333,15 +406,21 @@ class StreamDataset(IterableDataset[Any]):
                 raise InputError(f"is {state[name]} in the state, but {own} here", path=name)
         self._begin = state["next"] or 0
 
-    def _items(self, index: int, workers: int) -> Iterator[Any]:
+    def _rendered(self, batch: int, sizes: tuple[int, int]) -> list[Any]:
+        """Render a batch: items with their lines and numbers; `sizes` are the numbers of lanes and of workers."""
+        lanes, workers = sizes
         if self._maker is None:
             from .dataset.maker import Maker
 
             threads = self.threads or max(1, usable_cpus() // workers)
             self._maker = Maker(self.plan, self.frames, backend=self.backend, threads=threads)
-        for image in self._maker.make(index).images:
-            item = _item(self, image.line, image.pictures.get, f"sample {index}")
-            yield item if self.transform is None else self.transform(item)
+        first = self.batch_size * place(batch, self._count, lanes)
+        out = []
+        for index in self.samples[first : first + self.batch_size]:
+            for k, image in enumerate(self._maker.make(int(index)).images):
+                item = self.preparation.read(image.line, image.pictures.get, f"sample {index}")
+                out.append((item, image.line, (int(index), k)))
+        return out
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_maker": None}
@@ -354,11 +433,13 @@ def place(batch: int, count: int, lanes: int) -> int:
     return lane * length + min(lane, longer) + step
 
 
-def _checked(parts: Sequence[str]) -> tuple[str, ...]:
+def _check_pictures(plan: Plan, parts: Sequence[str]) -> None:
+    """Check that a spec makes the pictures of parts."""
     for part in parts:
-        if part not in PARTS:
-            raise InputError(f"must be some of {', '.join(PARTS)}, not {part!r}", path="parts")
-    return tuple(parts)
+        kind = PICTURES.get(part)
+        if kind is not None and kind not in plan.spec.labels.pictures:
+            key = f"geometry: [{kind}]" if kind in get_args(GeometryKind) else f"{kind}: true"
+            raise InputError(f"the spec makes none; add 'labels: {{{key}}}'", path=part)
 
 
 def _samples(plan: Plan, split: str | None) -> Sequence[int]:
@@ -372,98 +453,46 @@ def _samples(plan: Plan, split: str | None) -> Sequence[int]:
     return [i for i in spec.selection.samples if spec.selection.subject_of(i) in own]
 
 
-def _item(
-    data: FolderDataset | StreamDataset,
-    line: dict[str, Any],
-    picture: Callable[[str], NDArray[Any] | None],
-    where: str,
-) -> dict[str, Any]:
-    item: dict[str, Any] = {}
-    gamma = float(line.get("gamma") or 1.0) if data.encoding == "linear" else 1.0
-    try:
-        for part in data.parts:
-            item[part] = _value(part, line, picture, gamma)
-        return item | {key: line[key] for key in ("sample", "subject") if line.get(key) is not None}
-    except WRONG as error:
-        raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
+def _tensors(item: TrainingItem, preparation: Preparation, line: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert an item to tensors, with its flags and numbers."""
+    out = {part: _tensor(part, value) for part, value in item.parts.items()}
+    valid = {part: torch.from_numpy(flags) for part, flags in item.valid().items()}
+    if valid:
+        out["valid"] = valid
+    if preparation.flags:
+        out["mirrored"] = item.mirrored
+    return out | {key: line[key] for key in ("sample", "subject") if line.get(key) is not None}
 
 
-def _value(part: str, line: dict[str, Any], picture: Callable[[str], NDArray[Any] | None], gamma: float) -> Any:
-    if part in _PICTURES:
-        pixels = picture(_PICTURES[part])
-        if pixels is None:
-            raise KeyError(_PICTURES[part])
-        return _tensor(part, pixels, line["bit_depth"], gamma)
-    if part in ("pupil", "iris"):
-        ellipse, window = line["labels"][part]["amodal"], line["window_px"]
-        if ellipse["centre_px"] is None:
-            return torch.full((5,), math.nan)
-        x, y = ellipse["centre_px"]
-        return torch.tensor([x - window["x0"], y - window["y0"], *ellipse["semi_axes_px"], ellipse["angle_rad"]])
-    if part == "gaze":
-        there = line["labels"].get("eye_present", True)
-        return torch.tensor(line["labels"]["space"]["camera"]["line_of_sight"] if there else [math.nan] * 3)
-    others = {"glints": _glints, "lids": _lids, "camera": _camera}
-    return others[part](line) if part in others else line
+def _tensor(part: str, value: Any) -> Any:
+    """Convert a part; channels of pictures come first."""
+    if part == "line":
+        return value
+    if part == "camera":
+        return {k: _tensor(k, v) if isinstance(v, np.ndarray) else v for k, v in value.items()}
+    if part.endswith("mask") or part == "eye":
+        return torch.from_numpy(value.astype(np.int64))
+    values = torch.from_numpy(np.array(value, dtype=np.float32))
+    if part not in PICTURES:
+        return values
+    return values[None] if values.ndim == 2 else values.permute(2, 0, 1).contiguous()
 
 
-def _tensor(part: str, pixels: NDArray[Any], bit_depth: int, gamma: float) -> torch.Tensor:
-    """Convert the pixels of a picture; counts become shares of the full scale, to the power of a gamma."""
-    if part.endswith("mask"):
-        return torch.from_numpy(pixels.astype(np.int64))
-    values = np.array(pixels, dtype=np.float32)
-    if part in _ARRAYS:
-        array = torch.from_numpy(values)
-        return array[None] if array.ndim == 2 else array.permute(2, 0, 1).contiguous()
-    if pixels.dtype.kind == "u":
-        values /= 2**bit_depth - 1
-        values = values if gamma == 1 else values**gamma
-    return torch.from_numpy(values)[None]
+def _drawn() -> tuple[int, ...]:
+    """Draw a number from PyTorch's generator, which has another seed in each worker and each epoch."""
+    return (int(torch.randint(2**62, ())),)
 
 
-def _lids(line: dict[str, Any]) -> torch.Tensor:
-    """Landmarks (2, 17, 2) of the lids in px of the image."""
-    margins, window = line["labels"]["lid_margins_px"], line["window_px"]
-    if margins is None:
-        return torch.full((2, LID_MARKS, 2), math.nan)
-    return torch.tensor([margins["upper"], margins["lower"]]) - torch.tensor([window["x0"], window["y0"]])
+def _lamps_of(folder: ImageFolder) -> int:
+    """Return the largest number of lamps of a folder's rigs; all lines are read if the rig is drawn."""
+    vary = folder.dataset.get("kind") == "dataset" and lamps_vary(folder.dataset["spec"].get("scene") or {})
+    return max((len(entry.labels["lights_mm"]) for entry in folder.entries[: None if vary else 1]), default=0)
 
 
-def _glints(line: dict[str, Any]) -> torch.Tensor:
-    """Places (lights, 3) of the reflections in px of the image, and whether they are visible; NaN where none is.
-
-    Where the lamp's centre has no reflection, the place is that of the part of the lamp that has one.
-    """
-    window, labels = line["window_px"], line["labels"]
-    out = torch.full((len(labels["lights_mm"]), 3), math.nan)
-    for glint in labels["glints"]:
-        place = glint["xy_px"] or glint["spot_xy_px"]
-        if place is not None:
-            x, y = place
-            out[glint["light"]] = torch.tensor([x - window["x0"], y - window["y0"], float(glint["visible"])])
-    return out
-
-
-def _camera(line: dict[str, Any]) -> dict[str, Any]:
-    """The camera of an image, with a camera matrix for px of the image."""
-    own, window = PinholeCamera.from_labels(line["labels"]["camera"]), line["window_px"]
-    numbers = {"K": own.K, "R": own.R, "t_mm": own.t, "distortion": own.distortion}
-    out: dict[str, Any] = {key: torch.tensor(value.tolist(), dtype=torch.float32) for key, value in numbers.items()}
-    out["K"][0, 2] -= window["x0"]
-    out["K"][1, 2] -= window["y0"]
-    return {"index": int(line["parameters"]["camera"]), **out, "mirrored": own.mirrored}
-
-
-def _checked_encoding(encoding: str) -> str:
-    if encoding not in ("stored", "linear"):
-        raise InputError(f"must be 'stored' or 'linear', not {encoding!r}", path="encoding")
-    return encoding
-
-
-def _checked_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
-    if size is not None and not (len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)):
-        raise InputError(f"must be (width, height) in pixels, not {size!r}", path="size")
-    return size
+def _lamps_in(plan: Plan) -> int:
+    """Return the largest number of lamps in the rigs of a plan, looking at some subjects if the rig is drawn."""
+    scenes = (realise(plan, k).scene for k in plan.spread(_LOOKED_AT if lamps_vary(plan.spec.scene) else 1))
+    return max((len(scene.rig.lights) for scene in scenes if scene is not None), default=0)
 
 
 def _groups(samples: NDArray[Any], rows: NDArray[Any]) -> list[NDArray[Any]]:
@@ -471,56 +500,3 @@ def _groups(samples: NDArray[Any], rows: NDArray[Any]) -> list[NDArray[Any]]:
     order = np.argsort(samples, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(samples[order])) + 1)
     return [rows[part] for part in sorted(parts, key=lambda part: int(part[0]))]
-
-
-def _fitted(item: dict[str, Any], size: tuple[int, int], wanted: tuple[int, int]) -> dict[str, Any]:
-    """Scale the pictures of an image of a size (width, height), and its labels in px, into a wanted size."""
-    scale = min(wanted[0] / size[0], wanted[1] / size[1])
-    inner = [max(1, round(n * scale)) for n in size]
-    s = np.array(inner) / np.array(size)
-    first = [(w - n) // 2 for w, n in zip(wanted, inner, strict=True)]
-
-    def moved(xy: torch.Tensor) -> torch.Tensor:
-        """Move places (..., 2), pixel centres at integers."""
-        return (xy + 0.5) * torch.tensor(s, dtype=xy.dtype) - 0.5 + torch.tensor(first, dtype=xy.dtype)
-
-    out = dict(item)
-    for part, value in item.items():
-        if part in _PICTURES:
-            out[part] = _scaled(part, value, inner, (first, wanted))
-        elif part in ("pupil", "iris"):
-            out[part] = torch.cat([moved(value[:2]), _stretched(value[2:], s)])
-        elif part == "glints":
-            out[part] = torch.cat([moved(value[:, :2]), value[:, 2:]], dim=1)
-        elif part == "lids":
-            out[part] = moved(value)
-        elif part == "camera":
-            K = value["K"].clone()
-            K[:2, 2] = moved(K[:2, 2])
-            K[0, 0], K[1, 1] = K[0, 0] * s[0], K[1, 1] * s[1]
-            out[part] = {**value, "K": K}
-    return out
-
-
-def _scaled(
-    part: str, value: torch.Tensor, inner: Sequence[int], place: tuple[Sequence[int], tuple[int, int]]
-) -> torch.Tensor:
-    """Scale a picture to (width, height) `inner`, and put it at its first pixel in a picture of the wanted size."""
-    (x, y), (width, height) = place
-    flat = value if value.ndim == 3 else value[None]
-    smooth: dict[str, Any] = {"mode": "bilinear", "antialias": True, "align_corners": False}
-    how = smooth if part in ("image", "noiseless") else {"mode": "nearest-exact"}
-    found = torch.nn.functional.interpolate(flat[None].float(), size=(inner[1], inner[0]), **how)[0]
-    out = torch.full((len(flat), height, width), math.nan if part in _ARRAYS else 0.0)
-    out[:, y : y + inner[1], x : x + inner[0]] = found
-    return out.to(value.dtype) if value.ndim == 3 else out[0].to(value.dtype)
-
-
-def _stretched(ellipse: torch.Tensor, scale: NDArray[Any]) -> torch.Tensor:
-    """Scale semi-axes and angle (3,) of an ellipse by factors along x and y."""
-    a, b, angle = (float(v) for v in ellipse)
-    if math.isnan(a):
-        return ellipse
-    along = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]) * [a, b]
-    axes, sizes, _ = np.linalg.svd(scale[:, None] * along)
-    return torch.tensor([*sizes, math.atan2(axes[1, 0], axes[0, 0]) % math.pi], dtype=ellipse.dtype)

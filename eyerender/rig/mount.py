@@ -23,7 +23,7 @@ class Mount(Spec):
     translation_mm: Vec3 = Field(default=(0, 0, 0), description="shift after the turn")
     about_mm: Vec3 = Field(default=(0, 0, 0), description="the point that the turn leaves where it is")
 
-    def _motion(self) -> tuple[Floats, Floats]:
+    def motion(self) -> tuple[Floats, Floats]:
         """Return the rotation R and offset d (mm) of x' = R x + d."""
         rotation = np.eye(3)
         for axis, angle in enumerate(np.radians(np.array(self.rotation_deg, dtype=float))):
@@ -37,13 +37,13 @@ class Mount(Spec):
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
         """Move a camera, so that a moved world point has the same camera coordinates as before."""
-        rotation, offset = self._motion()
+        rotation, offset = self.motion()
         turned = camera.R @ rotation.T
         return replace(camera, R=frozen(turned), t=frozen(camera.t - rotated(turned, offset)))
 
     def lamp(self, lamp: Lamp) -> Lamp:
         """Move a light and turn its axis."""
-        rotation, offset = self._motion()
+        rotation, offset = self.motion()
         return replace(
             lamp,
             position_mm=frozen(rotated(rotation, lamp.position_mm) + offset),

@@ -78,20 +78,6 @@ def test_folders_of_different_cameras_join_at_one_size(folder, pair):
         assert 0 <= angle < np.pi
 
 
-def test_stretched_ellipses_are_those_of_stretched_points():
-    from eyerender.optics.ellipse import fit_ellipse_direct, points_on_ellipse
-    from eyerender.torch import _fitted
-
-    own = torch.tensor([40.0, 30.0, 12.0, 5.0, 0.7])
-    found = _fitted({"pupil": own}, (81, 60), (50, 50))["pupil"].tolist()
-    points = points_on_ellipse(own[:2].numpy().astype(float), own[2:4].numpy().astype(float), 0.7, 40)
-    s = np.array([50 / 81, round(60 * 50 / 81) / 60])
-    fit = fit_ellipse_direct((points + 0.5) * s - 0.5 + [0, (50 - round(60 * 50 / 81)) // 2])
-    np.testing.assert_allclose(found[:2], fit.centre_px, atol=1e-4)
-    np.testing.assert_allclose(found[2:4], fit.semi_axes_px, atol=1e-4)
-    assert found[4] == pytest.approx(float(fit.angle_rad), abs=1e-4)
-
-
 def test_a_group_holds_all_cameras_of_an_instant(pair):
     data = FolderDataset(pair, parts=("image", "camera", "line"), group="sample")
     assert len(data) == 4

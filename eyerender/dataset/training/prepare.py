@@ -1,0 +1,89 @@
+"""From a picture of a folder or a stream to one item for training: read, mirror left eyes, scale or augment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from ...base.errors import InputError
+from ..draws import is_draw
+from .augment import Augmentation
+from .item import PARTS, ItemReader, Picture, TrainingItem
+from .place import Placement, mirrored, placed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """What becomes of each picture.
+
+    Attributes:
+        parts: names of `PARTS`.
+        encoding: `stored` or `linear`.
+        size: (width, height) of the result; None: that of the picture.
+        lights: number of rows of `glints`; None: the number of the rig's lamps.
+        mirror_left: whether pictures of left eyes are mirrored.
+        augment: random changes.
+
+    Raises:
+        InputError: a part is unknown, or a value is out of range.
+    """
+
+    parts: tuple[str, ...]
+    encoding: str = "stored"
+    size: tuple[int, int] | None = None
+    lights: int | None = None
+    mirror_left: bool = False
+    augment: Augmentation | None = None
+
+    def __post_init__(self) -> None:
+        for part in self.parts:
+            if part not in PARTS:
+                raise InputError(f"must be some of {', '.join(PARTS)}, not {part!r}", path="parts")
+        if self.encoding not in ("stored", "linear"):
+            raise InputError(f"must be 'stored' or 'linear', not {self.encoding!r}", path="encoding")
+        size = self.size
+        if size is not None and not (len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)):
+            raise InputError(f"must be (width, height) in pixels, not {size!r}", path="size")
+        if self.lights is not None and self.lights < 0:
+            raise InputError(f"must be >= 0, not {self.lights}", path="lights")
+
+    @property
+    def flags(self) -> bool:
+        """Whether items say if they are mirrored."""
+        return self.mirror_left or self.augment is not None
+
+    @cached_property
+    def _reader(self) -> ItemReader:
+        linear, cuts = self.encoding == "linear", self.augment is not None
+        return ItemReader(parts=self.parts, linear=linear, lights=self.lights, mirrors=self.flags, cuts=cuts)
+
+    def read(self, line: Mapping[str, Any], picture: Picture, where: str) -> TrainingItem:
+        """Read an item; `where` names its line for messages.
+
+        Raises:
+            InputError: a picture or a label is missing or wrong.
+        """
+        item = self._reader.read(line, picture, where)
+        return mirrored(item) if self.mirror_left and line["records"][0]["eye"] == "left" else item
+
+    def finish(self, item: TrainingItem, key: Sequence[int] = ()) -> TrainingItem:
+        """Bring an item to the size, changed at random where asked for; changes follow from `key`."""
+        if self.augment is not None:
+            return self.augment.changed(item, self.size, key)
+        return item if self.size is None else placed(item, Placement.fit(item.size, self.size))
+
+
+def lamps_vary(scene: Mapping[str, Any]) -> bool:
+    """Return whether the number of lamps of a dataset's rig may differ from sample to sample."""
+    rig = scene.get("rig")
+    lights = rig.get("lights") if isinstance(rig, Mapping) else None
+    return not (isinstance(lights, list) and all(map(_is_plain, lights)))
+
+
+def _is_plain(light: Any) -> bool:
+    if not isinstance(light, Mapping) or is_draw(light):
+        return False
+    ring = light.get("ring") or {"count": 1}
+    return isinstance(ring, Mapping) and isinstance(ring.get("count"), int)
