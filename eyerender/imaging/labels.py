@@ -75,6 +75,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
     done, part, window = image.rendered, image.parts, image.window
     assert done.labels is not None
     known = known_labels(image.scene, truth, image)
+    whole_px = {name: whole_pixels(done.labels.amodal, known, name, window) for name in ("pupil", "iris")}
     points = truth.pupil.points_px[image.row]
     whole = bool(truth.pupil.ok[image.row]) and len(points) > 2
     return {
@@ -82,13 +83,13 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
         "pupil": {
             **known["pupil"],
             "visible": moments_ellipse(part == PUPIL, window),
-            "visible_fraction": finite_or_none(done.labels.visible_fraction(PUPIL)),
+            "visible_fraction": finite_or_none(done.labels.visible_fraction(PUPIL, whole_px["pupil"])),
             "visible_arcs_deg": visible_arcs_deg(part, PUPIL, points, window[:2]) if whole else None,
         },
         "iris": {
             **known["iris"],
             "visible": moments_ellipse((part == PUPIL) | (part == IRIS), window),
-            "visible_fraction": finite_or_none(done.labels.visible_fraction(IRIS)),
+            "visible_fraction": finite_or_none(done.labels.visible_fraction(IRIS, whole_px["iris"])),
         },
         "glints": [
             glint | _seen_glint(image, k, reason)
@@ -153,6 +154,29 @@ def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:
     angle = 0.5 * float(np.arctan2(2 * b, a - c)) % np.pi
     axes = [2 * float(np.sqrt(half + root)), 2 * float(np.sqrt(max(half - root, 0.0)))]
     return out | {"centre_px": [x + window[0], y + window[1]], "semi_axes_px": axes, "angle_rad": angle}
+
+
+def whole_pixels(amodal: Bytes, labels: dict[str, Any], name: str, window: Window) -> float:
+    """Return the size (px) of the whole pupil, or of the iris without it, also where it leaves the window.
+
+    It is the number of its pixels in the window, or the area of its outline if that is larger and leaves the window.
+    """
+    outline, pupil = (labels[part]["amodal"] for part in (name, "pupil"))
+    count = float(np.count_nonzero(amodal == (IRIS if name == "iris" else PUPIL)))
+    if not _leaves(outline, window):
+        return count
+    within = np.prod(pupil["semi_axes_px"]) if name == "iris" and pupil["centre_px"] is not None else 0.0
+    return max(count, float(np.pi * (np.prod(outline["semi_axes_px"]) - within)))
+
+
+def _leaves(outline: dict[str, Any], window: Window) -> bool:
+    """Return whether a part of an ellipse in full-sensor pixels lies outside a window."""
+    if outline["centre_px"] is None:
+        return False
+    c, s = np.cos(outline["angle_rad"]), np.sin(outline["angle_rad"])
+    half = np.hypot(*(np.array([[c, s], [-s, c]]) * np.array(outline["semi_axes_px"])[:, None]))
+    corners = np.array(outline["centre_px"]) + np.stack([-half, half])
+    return not bool(np.all(in_window(window, corners)))
 
 
 def visible_arcs_deg(
@@ -309,6 +333,8 @@ def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any
         column, row = np.rint(np.clip(spot - image.window[:2], 0, np.array(image.window[2:]) - 1)).astype(int)
         if image.lens_reflections[row, column]:
             visible, hidden_by = False, "occluded by lens reflection"
+    elif lit and table.visible[k]:
+        hidden_by = "outside the picture"
     return {
         "visible": visible,
         "hidden_by": hidden_by,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -13,8 +14,9 @@ from skimage.draw import polygon2mask
 
 from eyerender.dataset.export import export
 from eyerender.dataset.export.item import Item
-from eyerender.dataset.export.keypoints import box, keypoints, names
-from eyerender.dataset.export.yolo import polygons
+from eyerender.dataset.export.keypoints import box, keypoints, mirrored_order, names
+from eyerender.dataset.export.yolo import _pose, polygons
+from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageEntry, ImageFolder
 
 
@@ -60,6 +62,44 @@ def test_keypoints_have_places_in_the_image_and_are_visible_hidden_or_unknown():
     assert box(keypoints(item_of(np.zeros((30, 40), np.uint8)), 2), covered) is None
 
 
+def test_landmarks_behind_a_frame_are_hidden():
+    mask = np.zeros((30, 40), np.uint8)
+    along = [[105.0 + 2 * k, 60.0] for k in range(17)]
+    item = item_of(mask, lid_margins_px={"upper": along, "lower": along})
+    item.__dict__["_classes"] = np.where(np.arange(40) < 12, 5, mask)
+    found = dict(zip(names(0), keypoints(item, 0), strict=True))
+    assert [found[f"upper_lid_{k}"][2] for k in range(4)] == [1, 1, 2, 2]
+
+
+@pytest.mark.parametrize("radius", [7.3, 12.0, 40.2])
+def test_ultralytics_fills_polygons_as_our_masks(radius):
+    """Its `polygon2mask` cuts off the decimals of corners, and OpenCV fills the border as well."""
+    v, u = np.mgrid[:120, :160]
+    inside = ((u - 78.6) / radius) ** 2 + ((v - 61.3) / (0.8 * radius)) ** 2 < 1
+    (polygon,) = polygons(inside)
+    text = np.array([float(f"{n:.6f}") for n in ((polygon + 0.5) / [160, 120]).ravel()]).reshape(-1, 2)
+    again = np.zeros(inside.shape, np.uint8)
+    cv2.fillPoly(again, [(text * [160, 120]).astype(np.int32)], 1)
+    assert np.count_nonzero(inside & (again > 0)) / np.count_nonzero(inside | (again > 0)) >= 0.99
+
+
+def test_boxes_of_yolo_stay_in_the_picture_after_rounding():
+    for width in (37, 123, 640):
+        mask = np.ones((31, width), np.uint8)
+        item = item_of(mask)
+        item.entry.line["window_px"] |= {"width": width, "height": 31}
+        (row,) = _pose(item, 0)
+        x, y, w, h = (float(n) for n in row.split()[1:5])
+        assert min(x - w / 2, y - h / 2) >= 0
+        assert max(x + w / 2, y + h / 2) <= 1
+        assert (w, h) == pytest.approx((1, 1), abs=3e-6)
+
+
+def test_mirrored_keypoints_are_renamed_by_their_lamps():
+    assert mirrored_order([1, 0, 2])[:5] == [0, 2, 1, 3, 4]
+    assert mirrored_order([]) == list(range(19))
+
+
 def test_polygons_enclose_the_pixels_of_each_part():
     v, u = np.mgrid[:60, :80]
     inside = ((u - 30) ** 2 + (v - 25) ** 2 < 400) | ((u - 68) ** 2 + (v - 45) ** 2 < 60)
@@ -93,9 +133,32 @@ def test_coco_has_keypoints_of_the_eye(tiny, tmp_path):
             centre = np.array(line["labels"]["pupil"]["amodal"]["centre_px"])
             window = line["window_px"]
             np.testing.assert_allclose(mark["keypoints"][:2], centre - [window["x0"], window["y0"]])
+            v, u = np.nonzero(np.isin(read_image(tiny / line["mask_file_name"])[0], (1, 2, 3)))
+            x, y, w, h = mark["bbox"]  # in the corners of masks
+            assert (x, y, x + w, y + h) == (u.min(), v.min(), u.max() + 1, v.max() + 1)
             assert (image["camera"], image["camera_name"]) == (0, "camera")
             seen += 1
+        assert precision(path, "keypoints") == pytest.approx(1)
     assert seen == 24
+    for path in sorted((tmp_path / "out" / "annotations").glob("instances_*.json")):
+        assert precision(path, "segm") == precision(path, "bbox") == pytest.approx(1)
+    assert "kpt_oks_sigmas" in (tmp_path / "out" / "README.md").read_text()
+
+
+def precision(path, kind):
+    """Average precision of the truth against itself, with the call that the card shows."""
+    from pycocotools import coco, cocoeval
+
+    truth = coco.COCO(path)
+    found = truth.loadRes([{**mark, "score": 1.0} for mark in truth.dataset["annotations"]])
+    evaluation = cocoeval.COCOeval(truth, found, kind)
+    evaluation.params.kpt_oks_sigmas = np.array(truth.dataset["info"]["sigmas"])
+    if kind == "keypoints":  # COCO ignores objects without keypoints
+        assert len(evaluation.params.kpt_oks_sigmas) == len(truth.loadCats([1])[0]["keypoints"])
+    evaluation.evaluate()
+    evaluation.accumulate()
+    evaluation.summarize()
+    return float(evaluation.stats[0])
 
 
 @pytest.mark.render
@@ -121,6 +184,7 @@ def test_yolo_reads_its_folder(tiny, tmp_path, format):
             assert np.count_nonzero(again != (entry.mask() == 3)) <= 0.06 * again.sum() + 4
         else:
             points, _ = data["kpt_shape"]
+            assert data["flip_idx"] == [0, 2, 1, *range(3, points)]  # both lamps change sides
             (row,) = rows
             assert len(row) == 5 + 3 * points
             x, y = float(row[5]) * width - 0.5, float(row[6]) * height - 0.5

@@ -180,8 +180,8 @@ def test_what_is_cut_off_or_covered_counts_as_unseen():
 def test_lamps_are_renamed_by_their_mirrored_places():
     ring = [[0, 10 * np.cos(a), 10 * np.sin(a)] for a in np.arange(6) * np.pi / 3]
     assert partners(np.array(ring), 1).tolist() == [3, 2, 1, 0, 5, 4]
-    assert partners(np.array(ring) + [0, 0.3, 0], 1).tolist() == [3, 2, 1, 0, 5, 4]  # 0.6 mm off
-    assert partners(np.array(ring) + [0, 0.6, 0], 1) is None
+    assert partners(np.array(ring) + np.array([0, 0.3, 0]), 1).tolist() == [3, 2, 1, 0, 5, 4]  # 0.6 mm off
+    assert partners(np.array(ring) + np.array([0, 0.6, 0]), 1) is None
     assert partners(np.array(ring[:2] + ring[4:]), 1) is None
     assert partners(np.zeros((0, 3)), 1).tolist() == []
 

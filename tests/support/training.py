@@ -91,7 +91,7 @@ def line_of(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]
     rows = np.linspace(0, 1, 17)[:, None] * [6.0, 1.0]
     right = scene.spec.subject.eyes == ("right",)
     along = np.array([w - 1 - 30.0, 40.0]) + rows * [-1, 1] if right else np.array([30.0, 40.0]) + rows
-    labels |= {"lid_margins_px": {"upper": along.tolist(), "lower": (along + [0, 30]).tolist()}}
+    labels |= {"lid_margins_px": {"upper": along.tolist(), "lower": (along + np.array([0, 30])).tolist()}}
     labels["lid_opening"] = {"mm": 9.5, "share": 1.1}
     (record,) = found.records()
     line = image_line(scene, record, view.window, labels)

@@ -7,6 +7,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -21,10 +22,19 @@ torch = pytest.importorskip("torch", reason="needs PyTorch; run ./scripts/test-t
 
 from torch.utils.data import DataLoader  # noqa: E402
 
-from eyerender.torch import PARTS, FolderDataset, StreamDataset, collate, place  # noqa: E402
+from eyerender.dataset.training.item import LABELS  # noqa: E402
+from eyerender.torch import PARTS, Augment, FolderDataset, StreamDataset, collate, place  # noqa: E402
 
 pytestmark = pytest.mark.render
-LACKING = ("amodal_mask", "highlight_mask", "instance_mask", "depth", "normals", "iris_coordinates")
+LACKING = (
+    "amodal_mask",
+    "highlight_mask",
+    "lens_reflection_mask",
+    "instance_mask",
+    "depth",
+    "normals",
+    "iris_coordinates",
+)
 ALL = tuple(part for part in PARTS if part not in LACKING)
 
 
@@ -38,7 +48,7 @@ def same(a, b):
         if isinstance(value, torch.Tensor):
             assert value.dtype == b[key].dtype
             torch.testing.assert_close(value, b[key], rtol=0, atol=0, equal_nan=True)
-        elif key == "camera":
+        elif key in ("camera", "valid"):
             same(value, b[key])
         else:
             assert value == b[key]
@@ -88,6 +98,12 @@ def test_a_folder_gives_its_pictures_and_labels(folder):
         to_target = np.array(space["target_mm"]) - space["globe_centre_mm"]
         assert item["gaze"] @ torch.tensor(to_target / np.linalg.norm(to_target), dtype=torch.float32) > 0.99
         assert torch.linalg.norm(item["gaze"]) == pytest.approx(1, abs=1e-6)
+        azimuth, elevation = torch.deg2rad(item["optic_axis_deg"])
+        pose = torch.tensor([entry.records[0]["pose"][f"{a}_deg"] for a in ("azimuth", "elevation")])
+        assert torch.rad2deg(torch.stack([azimuth, elevation])) == pytest.approx(pose, abs=1e-3)
+        assert item["valid"].keys() == {part for part in LABELS if part in ALL}
+        assert item["valid"]["gaze"]
+        assert item["eye"] == 0
 
 
 def test_a_rendered_scene_is_a_folder_too(spec, tmp_path):
@@ -148,6 +164,55 @@ def test_a_split_of_a_stream_is_that_of_the_folder(folder, spec):
         own = FolderDataset(folder, split=split, parts=())
         stream = StreamDataset(spec, split=split, parts=("image",), batch_size=3)
         assert numbers(stream) == [own[k]["sample"] for k in range(len(own))]
+
+
+def test_a_stream_yields_each_picture_again_with_other_changes(spec):
+    options = {"batch_size": 4, "shuffle": 2, "reuse": 3, "lanes": 2, "parts": ("image", "glints", "eye"),
+               "size": (48, 40), "augment": Augment(seed=1)}  # fmt: skip
+    stream = StreamDataset(spec, **options)
+    found = list(stream)
+    assert len(found) == len(stream) == 15
+    assert sorted(numbers(found)) == sorted(3 * list(range(20)))
+    assert found[0]["image"].shape == (4, 1, 40, 48)
+    of_first = [batch["image"][k] for batch in found for k in range(4) if batch["sample"][k] == 0]
+    assert all(not torch.equal(a, b) for a, b in pairwise(of_first))
+    for batch in found[:6]:  # the window of the first two batches, each time in another order
+        assert set(batch["sample"].tolist()) <= {0, 1, 2, 3, 12, 13, 14, 15}
+    # A resumed stream makes the same, and so do two ranks together.
+    resumed = StreamDataset(spec, **options, start=7)
+    assert len(resumed) == 8
+    for got, want in zip(resumed, found[7:], strict=True):
+        same(got, want)
+    ranks = [StreamDataset(spec, **options, rank=rank, ranks=2) for rank in range(2)]
+    assert [len(one) for one in ranks] == [len(numbers(one)) // 4 for one in ranks] == [9, 6]
+
+
+def test_a_folder_is_changed_anew_in_each_epoch_and_mirrors_left_eyes(folder):
+    data = FolderDataset(folder, parts=(*LABELS, "mask", "image", "camera"), size=(64, 64), augment=Augment(),
+                         mirror_left=True)  # fmt: skip
+    loader = DataLoader(data, batch_size=10)
+    torch.manual_seed(3)
+    first, second = (torch.cat([batch["image"] for batch in loader]) for _ in range(2))
+    assert not torch.equal(first, second)
+    torch.manual_seed(3)
+    batch = next(iter(loader))
+    torch.testing.assert_close(batch["image"], first[:10])
+    assert batch["mirrored"].any()
+    assert not batch["mirrored"].all()
+    assert batch["valid"]["glints"].shape == (10, 2)
+    assert torch.equal(batch["eye"], batch["mirrored"].long())  # the folder's eyes are right ones
+
+
+def test_pictures_of_ones_own_are_changed_alike(folder):
+    item = FolderDataset(folder)[0]
+    torch.manual_seed(0)
+    own = {"image": (item["mask"] == 3)[None].float(), "mask": item["mask"]}
+    found = Augment(erase=0, noise=(0, 0), blur_px=(0, 0), compression=0)(own, (64, 48))
+    assert found["image"].shape == (1, 48, 64)
+    assert found["mask"].dtype == torch.int64
+    assert ((found["image"][0] > 0.5) == (found["mask"] == 3)).float().mean() > 0.97
+    with pytest.raises(InputError, match="item: cannot be changed here; give 'augment' to the dataset"):
+        Augment()({**own, "gaze": torch.zeros(3)})
 
 
 def test_every_batch_has_one_place():
@@ -261,6 +326,11 @@ def test_bad_arguments_are_one_line(folder, spec, tmp_path):
         (lambda: StreamDataset("no_such_spec"), "no such dataset file"),
         (lambda: StreamDataset(spec, batch_size=0), "batch_size: must be >= 1, not 0"),
         (lambda: StreamDataset(spec, start=-1), "start: must be >= 0, not -1"),
+        (lambda: StreamDataset(spec, reuse=0), "reuse: must be >= 1, not 0"),
+        (
+            lambda: FolderDataset(folder, parts=("glints",), lights=1)[0],
+            "lights: must be >= 2, the number of the lamps",
+        ),
         (lambda: StreamDataset(spec, rank=2, ranks=2), "rank: must be 0 to 1, not 2"),
         (lambda: StreamDataset(spec, threads=0), "threads: must be >= 1, not 0"),
         (lambda: StreamDataset(spec, split="val"), "split: must be one of train, validation, test, not 'val'"),

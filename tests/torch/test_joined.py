@@ -13,7 +13,8 @@ torch = pytest.importorskip("torch", reason="needs PyTorch; run ./scripts/test-t
 
 from torch.utils.data import ConcatDataset, DataLoader  # noqa: E402
 
-from eyerender.torch import FolderDataset, StreamDataset, collate  # noqa: E402
+from eyerender.dataset.training.item import LABELS  # noqa: E402
+from eyerender.torch import FolderDataset, StreamDataset, collate, person_names  # noqa: E402
 
 pytestmark = pytest.mark.render
 CAMERA = TINY["scene"]["rig"]["cameras"][0]
@@ -59,14 +60,15 @@ def test_parts_of_points_cameras_and_geometry(pair):
 
 
 def test_folders_of_different_cameras_join_at_one_size(folder, pair):
-    parts = ("image", "mask", "pupil", "camera")
+    parts = ("image", "mask", *LABELS, "camera")
     with pytest.raises(InputError, match="image: has different sizes in a batch; give FolderDataset a size"):
         next(iter(DataLoader(ConcatDataset([FolderDataset(f) for f in (folder, pair)]), 28, collate_fn=collate)))
     both = ConcatDataset([FolderDataset(f, parts=parts, size=(70, 50)) for f in (folder, pair)])
-    batch = next(iter(DataLoader(both, 28, collate_fn=collate)))
+    batch = next(iter(DataLoader(both, 28)))
     assert batch["image"].shape == (28, 1, 50, 70)
     assert batch["mask"].shape == (28, 50, 70)
     assert batch["camera"]["K"].shape == (28, 3, 3)
+    assert batch["valid"]["person"].shape == batch["person"].shape == (28, len(person_names()))
     assert 0 <= float(batch["image"].min()) <= float(batch["image"].max()) <= 1
     for mask, (x, y, a, b, angle) in zip(batch["mask"], batch["pupil"].tolist(), strict=True):
         if not (8 < x < 62 and 8 < y < 42):

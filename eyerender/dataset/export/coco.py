@@ -3,6 +3,13 @@
 Instances are run-length masks of pupil, iris and sclera. Keypoints are the pupil's centre, the glints and nine
 landmarks of each lid from the temple to the nose, of one eye per image: x, y, v with v 2 visible, 1 hidden, 0 none.
 
+`cut` of a pupil or an iris tells whether its visible part touches the edge of the image. Boxes begin at the left and
+upper edge of a pixel, and `x` and `y` of keypoints are centres of pixels. `info.sigmas` are for pycocotools, which
+knows only those of people by itself:
+
+    evaluation = COCOeval(truth, found, "keypoints")
+    evaluation.params.kpt_oks_sigmas = np.array(truth.dataset["info"]["sigmas"])
+
 Each image has its gaze (`line_of_sight`, `optic_axis`, ...), the diameters of its pupil, and `camera`, `camera_name`.
 Among the instances, glints are instances of their own with one keypoint each: [x, y, v], v 2 visible, 1 hidden.
 """
@@ -26,7 +33,7 @@ from ...folders.imagefile import png_bytes
 from ...optics.ellipse import Ellipse
 from .gaze import DIRECTIONS, gaze_of, pupil_of
 from .item import Item, Items
-from .keypoints import box, keypoints, names
+from .keypoints import SIGMA, box, keypoints, names, sigmas
 
 # Except for the glints, a category's id is the part's value in the mask.
 CATEGORIES: list[dict[str, Any]] = [
@@ -46,8 +53,9 @@ def write(items: Items, out: Path) -> None:
         points: dict[str, _Annotations] = {}
         for split in items.splits:
             (out / split).mkdir()
-            files[split] = stack.enter_context(_Annotations(items, out, f"instances_{split}", CATEGORIES))
-            points[split] = stack.enter_context(_Annotations(items, out, f"keypoints_{split}", [eye]))
+            files[split] = stack.enter_context(_Annotations(items, out, f"instances_{split}", CATEGORIES, [SIGMA]))
+            own = _Annotations(items, out, f"keypoints_{split}", [eye], sigmas(items.lights))
+            points[split] = stack.enter_context(own)
         for number, made in enumerate(items.map(partial(_annotated, lights=items.lights)), start=1):
             write_bytes(out / made.split / made.image["file_name"], made.picture, sync=False)
             for annotations in (files, points):
@@ -89,6 +97,8 @@ def _annotated(item: Item, lights: int) -> _Annotated:
         inside = mask == value
         if inside.any():
             marks.append(_instance(value, inside, item.ellipse(part) if part != "sclera" else None))
+            if part != "sclera":
+                marks[-1]["cut"] = line["labels"][part]["visible"]["cut"]
     marks += [_glint(*glint) for glint in item.glints()]
     image = {"file_name": f"{item.name}.png", **size, **about}
     eye = _eye(item, lights)
@@ -104,14 +114,17 @@ def _gaze(line: dict[str, Any]) -> dict[str, Any]:
 class _Annotations:
     """Writer of annotations/NAME.json: images at once, annotations to a second file until the end."""
 
-    def __init__(self, items: Items, out: Path, name: str, categories: list[dict[str, Any]]) -> None:
+    def __init__(
+        self, items: Items, out: Path, name: str, categories: list[dict[str, Any]], falloffs: list[float]
+    ) -> None:
         self._path = out / "annotations" / f"{name}.json"
         self._beside = self._path.with_suffix(".annotations")
         self._images: IO[str] = open(self._path, "w", encoding="utf-8")  # noqa: SIM115  (closed by __exit__)
         self._marks: IO[str] = open(self._beside, "w+", encoding="utf-8")  # noqa: SIM115
         self._image_count = self._mark_count = 0
+        about = {"description": items.name, "version": "1", "sigmas": falloffs}
         head = {
-            "info": {"description": items.name, "version": "1", "image": items.encoding.to_mapping()},
+            "info": {**about, "image": items.encoding.to_mapping()},
             "licenses": [] if items.licence is None else [{"id": 1, "name": items.licence}],
             "categories": categories,
         }
@@ -175,7 +188,7 @@ def _eye(item: Item, lights: int) -> dict[str, Any] | None:
         "category_id": 1,
         "keypoints": [value for place in places for value in place],
         "num_keypoints": sum(v > 0 for _, _, v in places),
-        "bbox": found,
+        "bbox": [found[0] + 0.5, found[1] + 0.5, *found[2:]],  # a pixel's left and upper edge, as of masks
         "area": found[2] * found[3],
         "iscrowd": 0,
     }

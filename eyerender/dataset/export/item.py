@@ -22,6 +22,7 @@ from ...optics.ellipse import Ellipse, signed_distance
 from ...rig.camera import PinholeCamera
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
 from ..selection import scrambled
+from ..training.symmetry import mirrored_lamps
 from .encoding import STORED, Encoding
 
 Prepared = TypeVar("Prepared")
@@ -114,8 +115,18 @@ class Item:
     @cached_property
     def mask(self) -> Bytes:
         """Mask (h, w): 0 background, skin, or frame of the view or of spectacles, 1 sclera, 2 iris, 3 pupil."""
-        mask = self.entry.mask()
+        mask = self._classes
         return np.zeros(self.image.shape, np.uint8) if mask is None else np.where(mask > PUPIL, BACKGROUND, mask)
+
+    @cached_property
+    def _classes(self) -> Bytes | None:
+        """Mask with all classes."""
+        return self.entry.mask()
+
+    def behind_frame(self, x: float, y: float) -> bool:
+        """Return whether a frame of the view or of spectacles covers a place in the image."""
+        mask = self._classes
+        return mask is not None and bool(mask[round(y), round(x)] > PUPIL)
 
     @cached_property
     def amodal(self) -> Bytes:
@@ -192,6 +203,7 @@ class Items:
         gammas: gammas of the images.
         sizes: (width, height) of the images.
         lights: largest number of reflections of an image.
+        mirrored_lamps: number of each lamp in a mirrored image (`training.symmetry`); None unless all images agree.
         file_name_bytes: length of the longest name of an image, in UTF-8.
         place: file and number of the line that is being read, for messages.
     """
@@ -207,6 +219,7 @@ class Items:
         self.gammas: set[float] = set()
         self.sizes: set[tuple[int, int]] = set()
         self.lights = self.file_name_bytes = 0
+        self.mirrored_lamps: tuple[int, ...] | None = None
         self.place = folder.path / METADATA, 0
 
     def survey(self) -> None:
@@ -218,6 +231,7 @@ class Items:
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)
+        lamps: set[tuple[int, ...] | None] = set()
         without: LinePlace | None = None  # the first line that names no sample
         count_of_samples = 0
         for row, own in enumerate(self._each(_surveyed)):
@@ -229,7 +243,9 @@ class Items:
             self.gammas.add(own.gamma)
             self.sizes.add(own.size)
             self.lights = max(self.lights, own.lights)
+            lamps.add(own.mirrored_lamps)
             self.file_name_bytes = max(self.file_name_bytes, own.file_name_bytes)
+        self.mirrored_lamps = lamps.pop() if len(lamps) == 1 else None
         if without is not None and count_of_samples:
             raise InputError(
                 "is null, but other images name theirs", source=str(without[0]), path=f"line {without[1]}.sample"
@@ -334,10 +350,12 @@ class _Surveyed:
     gamma: float
     size: tuple[int, int]
     lights: int
+    mirrored_lamps: tuple[int, ...] | None
     file_name_bytes: int
 
 
 def _surveyed(item: Item) -> _Surveyed:
+    lamps = mirrored_lamps(item.line)
     return _Surveyed(
         sample=item.line["sample"],
         is_of_sample=item.entry.line["sample"] is not None,
@@ -347,5 +365,6 @@ def _surveyed(item: Item) -> _Surveyed:
         gamma=item.entry.gamma,
         size=item.entry.window[2:],
         lights=len(item.line["labels"]["lights_mm"]),
+        mirrored_lamps=None if lamps is None else tuple(lamps.tolist()),
         file_name_bytes=len(item.entry.name.encode()),
     )

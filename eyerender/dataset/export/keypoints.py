@@ -1,10 +1,13 @@
 """Keypoints of an image, in pixels of the image: the pupil's centre, the glints and landmarks of both lids.
 
 Each is (x, y, v) with v as in COCO: 2 visible, 1 hidden, 0 unknown or not in the image (x = y = 0 then). Landmarks of a
-lid run from the temple to the nose, for either eye, so a mirrored image keeps their names.
+lid run from the temple to the nose, for either eye, so a mirrored image keeps their names; they are hidden behind a
+frame of the view or of spectacles.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,6 +15,7 @@ from .item import Item
 
 LID_MARKS = 9  # of each lid, canthi included
 _PLACE = tuple[float, float, int]
+SIGMA, _LID_SIGMA = 0.025, 0.072
 _NOWHERE: _PLACE = (0.0, 0.0, 0)
 
 
@@ -19,6 +23,20 @@ def names(lights: int) -> list[str]:
     """List the names of the keypoints of a dataset with so many lights."""
     lids = [f"{lid}_lid_{k}" for lid in ("upper", "lower") for k in range(LID_MARKS)]
     return ["pupil_centre", *(f"glint_{k}" for k in range(lights)), *lids]
+
+
+def sigmas(lights: int) -> list[float]:
+    """Return the falloffs of COCO's similarity of keypoints, in the order of `names`; they are chosen.
+
+    Centres are as exact as COCO's eyes, landmarks of lids as its elbows.
+    """
+    return [SIGMA] * (1 + lights) + [_LID_SIGMA] * (2 * LID_MARKS)
+
+
+def mirrored_order(lamps: Sequence[int]) -> list[int]:
+    """Return the index that each keypoint has in a mirrored image; `lamps` says it of each lamp."""
+    rest = range(1 + len(lamps), len(names(len(lamps))))
+    return [0, *(1 + k for k in lamps), *rest]
 
 
 def keypoints(item: Item, lights: int) -> list[_PLACE]:
@@ -52,7 +70,8 @@ def _lids(item: Item) -> list[_PLACE]:
     for lid in ("upper", "lower"):
         marks = np.asarray(margins[lid], dtype=float)
         for k in np.linspace(0, len(marks) - 1, LID_MARKS).round().astype(int):
-            out.append(_within(item, (float(marks[k, 0]) - x0, float(marks[k, 1]) - y0, 2)))
+            x, y, v = _within(item, (float(marks[k, 0]) - x0, float(marks[k, 1]) - y0, 2))
+            out.append((x, y, 1 if v and item.behind_frame(x, y) else v))
     return out
 
 

@@ -60,6 +60,7 @@ def row_of(item: Item, lights: int) -> dict[str, Any]:
             ellipse = item.ellipse(part, kind)
             values = [None] * len(_ELLIPSE) if ellipse is None else ellipse.numbers()
             row |= {f"{part}_{kind}_{key}": value for key, value in zip(_ELLIPSE, values, strict=True)}
+        row[f"{part}_cut"] = int(labels[part]["visible"]["cut"])
         row[f"{part}_visible_fraction"] = labels[part]["visible_fraction"]
     spots = {light: (x, y, int(visible)) for light, x, y, visible in item.glints()}
     for k in range(lights):

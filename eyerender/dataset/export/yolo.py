@@ -3,7 +3,10 @@
 yolo-seg: a line `class x1 y1 x2 y2 ...` for each connected part of more than a few pixels. Polygons have no holes, so
 the classes contain each other: 0 eye (all that is visible between the lids), 1 iris with the pupil, 2 pupil.
 yolo-pose: one object per image, the eye: `0 x y w h` of its box, then x, y and visibility (2 visible, 1 hidden, 0 none)
-of the pupil's centre, the glints and nine landmarks of each lid from the temple to the nose.
+of the pupil's centre, the glints and nine landmarks of each lid from the temple to the nose. `flip_idx` renames glints
+by the mirrored places of their lamps; without such a symmetry of the rig it is missing, so trainers do not flip images.
+
+Polygons are drawn in by 0.01 px, because Ultralytics cuts off the decimals of corners and fills the border as well.
 """
 
 from __future__ import annotations
@@ -22,12 +25,14 @@ from ...base.storage.files import write_bytes
 from ...folders.imagefile import png_bytes
 from ...scene.parts import IRIS, PUPIL, SCLERA
 from .item import Item, Items
-from .keypoints import box, keypoints, names
+from .keypoints import box, keypoints, mirrored_order, names
 
 CLASSES = ("eye", "iris", "pupil")
 _FROM = (SCLERA, IRIS, PUPIL)  # the first part of a mask that belongs to each class
 _LEAST_PX = 20
 _TOLERANCE_PX = 0.25  # of polygons
+_INSET_PX = 0.01
+_EDGE = 1e-6  # of shares: their rounding does not lead out of the image
 # What the splits are called in data.yaml.
 _SPLITS = {"validation": "val", "valid": "val"}
 
@@ -40,8 +45,9 @@ def write_segments(items: Items, out: Path) -> None:
 def write_poses(items: Items, out: Path) -> None:
     """Write images and keypoints of every split."""
     points = names(items.lights)
-    # A mirrored image shows the other eye, whose landmarks have the same names.
-    more = {"kpt_shape": [len(points), 3], "flip_idx": list(range(len(points))), "kpt_names": {0: points}}
+    more = {"kpt_shape": [len(points), 3], "kpt_names": {0: points}}
+    if items.mirrored_lamps is not None:
+        more["flip_idx"] = mirrored_order(items.mirrored_lamps)
     _write(items, out, partial(_pose, lights=items.lights), more)
 
 
@@ -76,9 +82,9 @@ def _pose(item: Item, lights: int) -> Iterator[str]:
     if found is None:
         return
     h, w = item.mask.shape
-    left, top, width, height = found
-    numbers = [(left + width / 2 + 0.5) / w, (top + height / 2 + 0.5) / h, width / w, height / h]
-    text = [f"{n:.6f}" for n in numbers]
+    corner = np.array(found[:2]) + 0.5
+    low, high = (np.clip(edge / [w, h], _EDGE, 1 - _EDGE) for edge in (corner, corner + found[2:]))
+    text = [f"{n:.6f}" for n in (*(low + high) / 2, *(high - low))]
     for x, y, v in places:
         text += [*_shares(np.array([[x, y]]), (h, w)), str(v)] if v else ["0", "0", "0"]
     yield " ".join(["0", *text])
@@ -102,5 +108,13 @@ def polygons(inside: Bools) -> list[Floats]:
             continue
         outline = max(find_contours(np.pad(part, 1).astype(float), 0.5), key=len) - 1.0  # type: ignore[no-untyped-call]
         polygon = approximate_polygon(outline, _TOLERANCE_PX)[:-1]  # type: ignore[no-untyped-call]
-        out.append(np.asarray(polygon[:, ::-1]))
+        out.append(_drawn_in(np.asarray(polygon), part)[:, ::-1])
     return out
+
+
+def _drawn_in(polygon: Floats, part: Bools) -> Floats:
+    """Move corners (n, 2), rows and columns halfway between two pixels, towards the one in the part."""
+    low, high = np.floor(polygon).astype(int), np.ceil(polygon).astype(int)
+    padded = np.pad(part, 1)
+    inward = np.where(padded[low[:, 0] + 1, low[:, 1] + 1], -_INSET_PX, _INSET_PX)
+    return polygon + inward[:, None] * (high - low)

@@ -45,9 +45,9 @@ class PartLabels(ArrayValue):
         np.copyto(part, FRAME, where=covered)
         return replace(self, part=sealed(part))
 
-    def visible_fraction(self, part: int) -> float:
-        """Compute the visible share of a part's amodal pixels in the window; NaN if there are none."""
-        whole = int(np.count_nonzero(self.amodal == part))
+    def visible_fraction(self, part: int, whole: float | None = None) -> float:
+        """Compute the visible share of a part, of `whole` pixels or its amodal ones in the window; NaN if of none."""
+        whole = int(np.count_nonzero(self.amodal == part)) if whole is None else whole
         both = int(np.count_nonzero((self.amodal == part) & (self.part == part)))
         return both / whole if whole else float("nan")
 
