@@ -89,7 +89,7 @@ def trained(items: Items, steps: int) -> UNet:
         collate_fn=lambda batch: default_collate([varied(item) for item in batch]),
     )
     network = UNet().to(memory_format=torch.channels_last)  # faster on processors
-    train(network, loader, max(steps // max(len(loader), 1), 1), change=None, rate=3e-3)
+    train(network, loader, max(steps // max(len(loader), 1), 1), rate=3e-3)
     return network.eval()
 
 

@@ -28,9 +28,19 @@ from torch.nn import functional as F
 from torch.utils.data import ConcatDataset, DataLoader, default_collate
 from train_segmentation import PARTS, UNet, train
 
-from eyerender.torch import FolderDataset
+from eyerender.torch import Augment, FolderDataset
 
 WIDTH, HEIGHT = 192, 144
+AUGMENT = Augment(
+    scale=(0.55, 1.65),
+    shift=0.2,
+    roll_deg=17.0,
+    exposure=(0.6, 2.6),
+    gamma=(0.35, 1.1),
+    erase_size=(0.05, 0.5),
+    blur_px=(0.0, 1.7),
+    noise=(0.0, 0.04),
+)
 COLOURS = {1: (255, 120, 0), 2: (0, 220, 0), 3: (0, 0, 255)}  # sclera, iris, pupil; blue first
 
 
@@ -74,38 +84,17 @@ def between(low: float, high: float) -> float:
     return float(torch.empty(()).uniform_(low, high))
 
 
-def exposed(image: torch.Tensor) -> torch.Tensor:
-    """Change brightness, contrast, sharpness and noise of an image (1, h, w) at random, as cameras differ in them."""
-    image = (image ** between(0.35, 1.1) * between(0.6, 2.6)).clamp(0, 1)
-    which = between(0, 1)
-    if which < 0.4:
-        image = blurred(image, between(0.5, 1.7))
-    elif which < 0.7:  # an unsharp mask
+def sharpened(image: torch.Tensor) -> torch.Tensor:
+    """Sharpen some images (1, h, w) with an unsharp mask, as some cameras do, and change brightness and contrast."""
+    if between(0, 1) < 0.3:
         image = (image + between(0, 3) * (image - blurred(image, between(0.6, 1.5)))).clamp(0, 1)
-    image = levelled(image + between(0, 0.04) * torch.randn_like(image))
-    return image * between(0.85, 1.15) + between(-0.08, 0.08)
-
-
-def covered(image: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cover one side of an image (1, h, w) with an even grey, like the edge of a holder."""
-    angle, away = between(-np.pi, np.pi), between(0.45, 1.0)
-    y, x = (torch.linspace(-1, 1, n) for n in mask.shape)
-    behind = x[None] * np.cos(angle) + y[:, None] * np.sin(angle) > away
-    return torch.where(behind, between(0, 1), image), mask.masked_fill(behind, 0)
+    return levelled(image) * between(0.85, 1.15) + between(-0.08, 0.08)
 
 
 def varied(item: dict[str, Any]) -> dict[str, Any]:
     """Change the place, the scale and the exposure of an image at random, and cover a part of some images."""
-    (h, w), canvas = item["mask"].shape, (HEIGHT, WIDTH)
-    scale = between(0.55, 1.65) * float(np.sqrt(HEIGHT * WIDTH / (h * w)))
-    place = scale, 0.17 * float(torch.randn(())), torch.empty(2).uniform_(-0.4, 0.4)
-    image = placed(item["image"], *place, "bilinear", canvas)
-    mask = placed(item["mask"][None].float(), *place, "nearest", canvas)[0].long()
-    if between(0, 1) < 0.5:
-        image, mask = image.flip(-1), mask.flip(-1)
-    if between(0, 1) < 0.3:
-        image, mask = covered(image, mask)
-    return {"image": exposed(image), "mask": mask}
+    changed = AUGMENT(item, (WIDTH, HEIGHT))
+    return {**changed, "image": sharpened(changed["image"])}
 
 
 def shrunk(item: dict[str, Any]) -> dict[str, Any]:
@@ -131,7 +120,7 @@ def trained(folders: list[Path], epochs: int) -> UNet:
         collate_fn=lambda batch: default_collate([varied(item) for item in batch]),
     )
     network = UNet()
-    train(network, loader, epochs, change=None, rate=3e-3)  # the items are changed one by one
+    train(network, loader, epochs, rate=3e-3)
     return network.eval()
 
 

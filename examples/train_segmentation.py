@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,11 +28,23 @@ from torch import nn
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
-from eyerender.torch import FolderDataset
+from eyerender.torch import Augment, FolderDataset
 
-Change = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 PARTS = ("background", "sclera", "iris", "pupil", "frame")
 MUST = 0.9
+SIZE = (256, 160)  # of the pictures in training
+AUGMENT = Augment(
+    crop=(0.6, 0.8),
+    shift=0.0,
+    scale=(0.9, 1.1),
+    roll_deg=5.0,
+    exposure=(0.45, 1.8),
+    gamma=(1.0, 1.0),
+    erase=0,
+    blur_px=(0.0, 0.0),
+    noise=(0.0, 0.0),
+    compression=0.0,
+)
 
 
 def seen(item: dict[str, Any]) -> dict[str, Any]:
@@ -80,17 +91,6 @@ class UNet(nn.Module):
         return found
 
 
-def varied(images: torch.Tensor, masks: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cut a window of 256 x 160 px at random, mirror half of the batches, and change the brightness of each image."""
-    h, w = 160, 256
-    top, left = (int(torch.randint(0, n + 1, ())) for n in (images.shape[-2] - h, images.shape[-1] - w))
-    images, masks = (x[..., top : top + h, left : left + w] for x in (images, masks))
-    if torch.rand(()) < 0.5:
-        images, masks = images.flip(-1), masks.flip(-1)
-    gain = torch.empty(len(images), 1, 1, 1).uniform_(0.7, 1.3)
-    return (images * gain).clamp(0, 1), masks
-
-
 def loss_of(logits: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
     """Cross entropy plus soft Dice loss, which gives small parts the weight of large ones."""
     found, true = logits.softmax(1), F.one_hot(masks, len(PARTS)).movedim(-1, 1)
@@ -98,20 +98,15 @@ def loss_of(logits: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
     return F.cross_entropy(logits, masks) + 1 - ((2 * both + 1) / (all_ + 1)).mean()
 
 
-def train(
-    network: nn.Module, loader: DataLoader[Any], epochs: int, change: Change | None = varied, rate: float = 4e-3
-) -> None:
-    """Train a network on batches, each changed at random, and print its loss after each epoch."""
+def train(network: nn.Module, loader: DataLoader[Any], epochs: int, rate: float = 4e-3) -> None:
+    """Train a network on batches, and print its loss after each epoch."""
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=epochs * len(loader))
     for epoch in range(epochs):
         network.train()
         total = 0.0
         for batch in loader:
-            images, masks = batch["image"], batch["mask"]
-            if change is not None:
-                images, masks = change(images, masks)
-            loss = loss_of(network(images), masks)
+            loss = loss_of(network(batch["image"]), batch["mask"])
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -144,14 +139,15 @@ def main() -> int:
     options = parser.parse_args()
     torch.manual_seed(0)
     start = time.monotonic()
+    changes = {"train": {"size": SIZE, "augment": AUGMENT}, "test": {}}
     loaders = {
         split: DataLoader(
-            FolderDataset(options.folder, split=split, transform=seen),
+            FolderDataset(options.folder, split=split, transform=seen, **how),
             batch_size=4,
             shuffle=split == "train",
             num_workers=options.workers,
         )
-        for split in ("train", "test")
+        for split, how in changes.items()
     }
     network = UNet()
     train(network, loaders["train"], options.epochs)

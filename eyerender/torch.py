@@ -2,43 +2,16 @@
 
 This module needs PyTorch (the extra `torch`). `import eyerender` does not load it; write `import eyerender.torch`.
 
-Both datasets yield each image as a mapping with the requested parts:
-
-| part | value |
-|---|---|
-| `image`, `noiseless` | float32 (1, h, w): codes of the camera as a share of the full scale, 0 to 1 |
-| `mask`, `amodal_mask` | int64 (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 view frame, 5 spectacles |
-| `highlight_mask` | int64 (h, w): 1 where wet and oily surfaces mirror a lamp |
-| `lens_reflection_mask` | int64 (h, w): 1 where a spectacle lens mirrors more light than comes from behind it |
-| `instance_mask` | int64 (h, w): as `mask`, with 5 skin, 6 upper lid, 7 lower lid, 8 lashes, 9 brow, 10 caruncle |
-| `depth`, `normals`, `iris_coordinates` | float32 (1, h, w), (3, h, w), (2, h, w): arrays of geometry, nan: none |
-| `pupil`, `iris` | float32 (5,): ellipse of the amodal outline: x, y, a, b in px of the image, angle in rad |
-| `visible_pupil`, `visible_iris` | float32 (5,): ellipse with the second moments of the visible pixels |
-| `visible_fraction` | float32 (2,): visible share of the pupil and of the iris |
-| `pupil_mm` | float32 (2,): diameter of the entrance pupil and of the anatomical stop |
-| `glints` | float32 (lights, 3), row k for lamp k of the rig: x, y in px of the image, 1 visible or 0 hidden |
-| `lids` | float32 (2, 17, 2): landmarks of upper and lower lid in px, from the temple to the nose |
-| `lid_opening` | float32 (2,): opening of the lids in mm, and as a share of the person's at rest |
-| `gaze`, `optic_axis` | float32 (3,): unit vectors out of the eye in the camera's frame; `gaze` is the line of sight |
-| `gaze_rig`, `optic_axis_rig` | float32 (3,): the same in the rig's frame: the world's axes, turned with the rig |
-| `gaze_deg`, `optic_axis_deg` | float32 (2,): azimuth (to the subject's left) and elevation (up) in the rig's frame |
-| `centres_mm`, `centres_rig_mm` | float32 (3, 3): centres of globe, cornea and pupil in these two frames |
-| `eye` | int64: 0 right, 1 left |
-| `person` | float32 (n,): numbers of the person and this eye, in the order of `person_names()` |
-| `camera` | a mapping: `index`, `K` for px of the image, `R`, `t_mm`, `distortion` (8,), `fisheye`, `mirrored` |
-| `line` | the whole line of metadata, a dict; it is that of the image before any change |
-
-Numbers that are unknown are nan. `valid` is a mapping from each label among the parts to bool tensors: one for an
+Both datasets yield each image as a mapping with the requested parts, some of `PARTS`; docs/training.md has a table of
+them. Numbers that are unknown are nan. `valid` is a mapping from each label among the parts to bool tensors: one for an
 ellipse, a vector or `eye`, one per lamp, landmark, point or number of others. Labels of the pupil and of the gaze are
 not valid while under a tenth of the pupil shows. Glints and landmarks are valid in the picture alone.
 
 Pictures of any bit depth become shares of the full scale, so folders of different sensors can be joined; with `size`,
 those of different cameras, too. With `encoding="stored"`, the default, they are the codes that the camera stored, as in
-a recorded picture; `linear` undoes the camera's gamma. `distortion` of a camera is k1, k2, p1, p2, k3, k4, k5, k6
-(zeros where a lens has fewer), or k1, k2, k3, k4, p1, p2, nan, nan of a fisheye; where `mirrored`, u runs the other way
-about the principal point. Every mapping also has `sample` and `subject`, the numbers of the sample and of its subject.
-Folders that `render` wrote have the same labels, but no such numbers. With `mirror_left` or `augment`, `mirrored` says
-whether the picture and its labels are those of the mirrored scene.
+a recorded picture; `linear` undoes the camera's gamma. Every mapping also has `sample` and `subject`, the numbers of
+the sample and of its subject. Folders that `render` wrote have the same labels, but no such numbers. With `mirror_left`
+or `augment`, `mirrored` says whether the picture and its labels are those of the mirrored scene.
 """
 
 from __future__ import annotations

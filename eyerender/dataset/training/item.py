@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bools, Bytes, Floats, Ints
-from ...base.errors import WRONG, InputError
+from ...base.errors import InputError
 from ...population.people import SOLVED
 from ...population.table import default_table
 from ...region.mesh import LID_MARKS
 from ...rig.camera import PinholeCamera
 from ...scene.observation import EYES
-from .symmetry import mirrored_lamps, rig_pose
+from .symmetry import rig_pose
 
 PICTURES = {
     "image": "images",
@@ -115,68 +115,32 @@ class TrainingItem:
         return np.asarray(((xy >= -0.5) & (xy < np.array(self.size) - 0.5)).all(axis=-1))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ItemReader:
-    """Reads the parts of pictures.
+def part_of(part: str, line: Mapping[str, Any], picture: Picture, *, linear: bool, lights: int | None) -> Any:
+    """Read a part of a picture from its line and its pixels.
 
-    Attributes:
-        parts: names of `PARTS`.
-        linear: whether the gamma of the camera is undone.
+    Args:
+        part: one of `PARTS`.
+        line: the line of metadata (`eyerender/image/5`).
+        picture: returns the pixels of a kind of picture, None where there are none.
+        linear: whether the camera's gamma is undone.
         lights: number of rows of `glints`; None: the number of the rig's lamps.
-        mirrors: whether items may be mirrored.
-        cuts: whether a part of a picture may be cut off or covered.
+
+    Raises:
+        KeyError: there is no such picture, or the line lacks a key.
+        InputError: the rig has more lamps than `lights`.
     """
-
-    parts: tuple[str, ...]
-    linear: bool = False
-    lights: int | None = None
-    mirrors: bool = False
-    cuts: bool = False
-
-    def read(self, line: Mapping[str, Any], picture: Picture, where: str) -> TrainingItem:
-        """Read an item from its line of metadata.
-
-        Args:
-            line: the line (`eyerender/image/5`).
-            picture: returns the pixels of a kind of picture; None where there are none.
-            where: names the line in messages.
-
-        Raises:
-            InputError: there is no such picture, the line lacks a key, or the rig has more lamps than `lights`.
-        """
-        parts: dict[str, Any] = {}
-        part = "mask"
-        try:
-            labels, window = line["labels"], line["window_px"]
-            mask = _pixels("masks", picture) if self.cuts else None
-            for part in self.parts:
-                parts[part] = self._part(part, line, picture)
-            part = "glints"
-            lamps = mirrored_lamps(line) if self.mirrors else None
-            part = "visible_fraction"
-            return TrainingItem(
-                parts=parts,
-                size=(window["width"], window["height"]),
-                shown=_label(part, line),
-                there=bool(labels.get("eye_present", True)),
-                mask=mask,
-                lamps=lamps,
-            )
-        except WRONG as error:
-            raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
-
-    def _part(self, part: str, line: Mapping[str, Any], picture: Picture) -> Any:
-        if part in ("image", "noiseless"):
-            gamma = float(line.get("gamma") or 1.0) if self.linear else 1.0
-            return _shares(_pixels(PICTURES[part], picture), line["bit_depth"], gamma)
-        if part in PICTURES:
-            return _pixels(PICTURES[part], picture)
-        if part == "glints":
-            return _glints(line, self.lights)
-        return line if part == "line" else _label(part, line)
+    if part in ("image", "noiseless"):
+        gamma = float(line.get("gamma") or 1.0) if linear else 1.0
+        return _shares(pixels_of(PICTURES[part], picture), line["bit_depth"], gamma)
+    if part in PICTURES:
+        return pixels_of(PICTURES[part], picture)
+    if part == "glints":
+        return _glints(line, lights)
+    return line if part == "line" else _label(part, line)
 
 
-def _pixels(kind: str, picture: Picture) -> NDArray[Any]:
+def pixels_of(kind: str, picture: Picture) -> NDArray[Any]:
+    """Return the pixels of a kind of picture; raise `KeyError` where there are none."""
     pixels = picture(kind)
     if pixels is None:
         raise KeyError(kind)

@@ -55,7 +55,7 @@ def _mirrored(part: str, value: Any, last: float) -> Any:
     if part in ANGLES:
         return value * [-1.0, 1.0]
     if part == "eye":
-        return 1 - value
+        return np.array(1 - value)
     if part == "person":  # the right pupil's diameter less the left one's
         return np.where(np.array(person_names()) == "anisocoria_mm", -value, value)
     if part == "camera":

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-from ...base.errors import InputError
+from ...base.errors import WRONG, InputError
 from ..draws import is_draw
 from .augment import Augmentation
-from .item import PARTS, ItemReader, Picture, TrainingItem
+from .item import PARTS, Picture, TrainingItem, part_of, pixels_of
 from .place import Placement, mirrored, placed
+from .symmetry import mirrored_lamps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,22 +51,38 @@ class Preparation:
 
     @property
     def flags(self) -> bool:
-        """Whether items say if they are mirrored."""
+        """Whether items may be mirrored, and say so."""
         return self.mirror_left or self.augment is not None
 
-    @cached_property
-    def _reader(self) -> ItemReader:
-        linear, cuts = self.encoding == "linear", self.augment is not None
-        return ItemReader(parts=self.parts, linear=linear, lights=self.lights, mirrors=self.flags, cuts=cuts)
-
     def read(self, line: Mapping[str, Any], picture: Picture, where: str) -> TrainingItem:
-        """Read an item; `where` names its line for messages.
+        """Read an item; left eyes are mirrored if asked for.
+
+        Args:
+            line: the line of metadata (`eyerender/image/5`).
+            picture: returns the pixels of a kind of picture; None where there are none.
+            where: names the line in messages.
 
         Raises:
             InputError: a picture or a label is missing or wrong.
         """
-        item = self._reader.read(line, picture, where)
-        return mirrored(item) if self.mirror_left and line["records"][0]["eye"] == "left" else item
+        parts: dict[str, Any] = {}
+        part, how = "visible_fraction", {"linear": self.encoding == "linear", "lights": self.lights}
+        try:
+            shown = part_of(part, line, picture, **how)
+            for part in self.parts:
+                parts[part] = part_of(part, line, picture, **how)
+            part, window = "mask", line["window_px"]
+            item = TrainingItem(
+                parts=parts,
+                size=(window["width"], window["height"]),
+                shown=shown,
+                there=bool(line["labels"].get("eye_present", True)),
+                mask=None if self.augment is None else pixels_of("masks", picture),
+                lamps=mirrored_lamps(line) if self.flags else None,
+            )
+            return mirrored(item) if self.mirror_left and line["records"][0]["eye"] == "left" else item
+        except WRONG as error:
+            raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
 
     def finish(self, item: TrainingItem, key: Sequence[int] = ()) -> TrainingItem:
         """Bring an item to the size, changed at random where asked for; changes follow from `key`."""
