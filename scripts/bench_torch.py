@@ -6,7 +6,8 @@
 It needs PyTorch: .venv-torch/bin/python scripts/bench_torch.py, after scripts/test-torch has made that environment.
 Images are 640 x 480 px at 4 samples per pixel, without lids. All sides have two workers of one thread each and are
 measured in turn, three times each; the medians count. Rates are measured after every worker has made its first samples,
-or its first window of mixed images, so they exclude starting and compiling. --quick makes fewer images, once. The exit
+or its first window of mixed images, so they exclude starting and compiling. Random changes are measured in processor
+time, with pictures that are rendered already. --quick makes fewer images, once. The exit
 code is 1 if a `must` is missed.
 """
 
@@ -57,6 +58,21 @@ def streamed(count: int, backend: str, shuffle: int) -> float:
     return images / (time.perf_counter() - start)
 
 
+def changed(backend: str) -> float:
+    """Pictures of 128 x 128 px with labels that a stream changes and collates per processor second."""
+    from eyerender.torch import Augment, StreamDataset
+
+    parts = ("image", "mask", "pupil", "gaze", "glints", "visible_fraction")
+    stream = StreamDataset(
+        plan(BATCH, SHARD), batch_size=BATCH, parts=parts, size=(128, 128), augment=Augment(), reuse=60, backend=backend
+    )  # type: ignore[arg-type]
+    batches = iter(stream)
+    next(batches)  # which renders
+    start = time.process_time()
+    images = sum(len(batch["image"]) for batch in batches)
+    return images / (time.process_time() - start)
+
+
 def rows(backend: str, quick: bool) -> Iterable[Row]:
     """All rows, as they are measured."""
     count = 128 if quick else 256
@@ -69,6 +85,7 @@ def rows(backend: str, quick: bool) -> Iterable[Row]:
     yield row("stream, two workers of one thread each", streams, "images/s")
     yield row(f"the same, mixing {MIXED} batches of each worker", mixed, "images/s")
     yield row("stream against generate", streams / runs, "ratio", must=0.9, at_least=True)
+    yield row("changed by Augment to 128 x 128 px", changed(backend), "images/CPU s", must=200, at_least=True)
     yield row("mixed stream against stream", mixed / streams, "ratio", must=0.9, at_least=True)
 
 

@@ -245,13 +245,13 @@ BOUNDS = {
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2650,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 10270,  # the codes that cameras stored in every export, shards of a stated size, for trainers
+    "dataset": 11080,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3530,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
     "eye": 4290,  # spectacle lenses from prescriptions or as made, their frames; fixation, legs of rays, for the same
     "folders": 1850,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5410,  # tables of other trackers; intervals of budgets; precision, for laboratories
-    "imaging": 2360,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
+    "imaging": 2385,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
     "optics": 5180,
     "population": 2520,
     "region": 4150,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes

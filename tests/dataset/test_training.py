@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ def test_a_mirrored_left_eye_is_that_of_the_mirrored_scene(lens, mount, symmetri
     assert np.isfinite(truth.parts["glints"]).all()
     assert nans(mirrored) == nans(truth)
     found = differences(mirrored, truth)
-    assert {part: d for part, d in found.items() if d > 1e-9} == {}
+    assert max(found.values()) < 1e-9, found
     assert item_of(tree).mirrored is False
 
 
@@ -216,13 +215,3 @@ def test_rigs_with_fewer_lamps_get_rows_of_nan():
     for lights in ({"draw": "choice"}, [{"draw": "choice"}], [{"ring": {"count": {"draw": "integer"}}}]):
         assert lamps_vary({"rig": {"lights": lights}})
     assert len(person_names()) == len(set(person_names()))
-
-
-@pytest.mark.slow
-def test_augmentation_is_fast():
-    """At least 200 pictures of 128 x 128 per processor second, with labels."""
-    item = item_of(scene_tree(), augment=Augmentation())
-    start = time.process_time()
-    for k in range(200):
-        Augmentation().changed(item, (128, 128), [k])
-    assert 200 / (time.process_time() - start) > 200

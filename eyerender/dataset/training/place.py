@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...base.arrays import Floats
+from ...base.arrays import Bools, Floats
 from ...imaging.labels import moments_ellipse
 from ...scene.parts import IRIS, PUPIL
 from .item import ANGLES, ARRAYS, CAMERA_SPACE, ELLIPSES, PICTURES, RIG_SPACE, TrainingItem, person_names
@@ -118,11 +118,13 @@ class Placement:
         """Turn vectors (..., 3) of the camera's frame."""
         return np.concatenate([vectors[..., :2] @ self.rotation.T, vectors[..., 2:]], axis=-1)
 
-    def covered(self, xy: Floats) -> NDArray[np.bool_]:
-        """Return which places (..., 2) of the canvas are covered by a patch."""
-        x, y = xy[..., 0] + 0.5, xy[..., 1] + 0.5
-        hits = [(x >= left) & (x < right) & (y >= top) & (y < bottom) for left, right, top, bottom in self.patches]
-        return np.any(hits, axis=0) if hits else np.zeros(x.shape, dtype=bool)
+    def shows(self, x: Floats, y: Floats) -> Bools:
+        """Return which places of the canvas are on it and not covered by a patch."""
+        (width, height), seen = self.size, np.isfinite(x)
+        seen &= (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        for left, right, top, bottom in self.patches:
+            seen &= ~((x >= left - 0.5) & (x < right - 0.5) & (y >= top - 0.5) & (y < bottom - 0.5))
+        return np.asarray(seen)
 
 
 def placed(item: TrainingItem, at: Placement) -> TrainingItem:
@@ -131,7 +133,7 @@ def placed(item: TrainingItem, at: Placement) -> TrainingItem:
     parts = {part: _placed(part, value, at) for part, value in out.parts.items()}
     if "glints" in parts:
         glints = parts["glints"]
-        glints[:, 2] *= ~at.covered(glints[:, :2]) & out.inside(glints[:, :2])
+        glints[:, 2] *= at.shows(glints[:, 0], glints[:, 1])
     return replace(out, parts=parts)
 
 
@@ -139,19 +141,23 @@ def _cut(item: TrainingItem, at: Placement) -> TrainingItem:
     """Compute visible shares and ellipses from the pixels that remain, in px of the picture before it is moved."""
     if item.mask is None:
         return item
-    kept = np.zeros_like(item.mask)
-    v, u = np.nonzero((item.mask == PUPIL) | (item.mask == IRIS))
-    xy = at.moved(np.stack([u, v], axis=-1).astype(float))
-    stay = replace(item, size=at.size).inside(xy) & ~at.covered(xy)
-    if stay.all():
+    eye = (item.mask == PUPIL) | (item.mask == IRIS)
+    rows, columns = (np.flatnonzero(eye.any(axis=axis)) for axis in (1, 0))
+    if len(rows) == 0:
         return item
-    kept[v[stay], u[stay]] = item.mask[v[stay], u[stay]]
-    before, after = ([np.count_nonzero(mask == part) for part in (PUPIL, IRIS)] for mask in (item.mask, kept))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    v, u = np.arange(rows[0], rows[-1] + 1)[:, None], np.arange(columns[0], columns[-1] + 1)
+    x, y = (at.scale * (q[0] * u + q[1] * v) + d for q, d in zip(at.rotation, at.offset, strict=True))
+    own = item.mask[box] * eye[box]
+    kept = own * at.shows(x, y)
+    before, after = ([np.count_nonzero(mask == part) for part in (PUPIL, IRIS)] for mask in (own, kept))
+    if before == after:
+        return item
     share = np.array(after) / np.maximum(before, 1)
     parts = dict(item.parts)
     for part, inside in (("visible_pupil", kept == PUPIL), ("visible_iris", kept > 0)):
         if part in parts:
-            found = moments_ellipse(inside, (0, 0, *item.size))
+            found = moments_ellipse(inside, (columns[0], rows[0], *kept.shape[::-1]))
             none = found["centre_px"] is None
             numbers = [np.nan] * 5 if none else [*found["centre_px"], *found["semi_axes_px"], found["angle_rad"]]
             parts[part] = np.array(numbers)

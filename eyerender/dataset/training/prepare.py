@@ -71,13 +71,15 @@ class Preparation:
             shown = part_of(part, line, picture, **how)
             for part in self.parts:
                 parts[part] = part_of(part, line, picture, **how)
-            part, window = "mask", line["window_px"]
+            part, window, mask = "mask", line["window_px"], parts.get("mask")
+            if self.augment is not None and mask is None:
+                mask = pixels_of("masks", picture)
             item = TrainingItem(
                 parts=parts,
                 size=(window["width"], window["height"]),
                 shown=shown,
                 there=bool(line["labels"].get("eye_present", True)),
-                mask=None if self.augment is None else pixels_of("masks", picture),
+                mask=mask,
                 lamps=mirrored_lamps(line) if self.flags else None,
             )
             return mirrored(item) if self.mirror_left and line["records"][0]["eye"] == "left" else item
