@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from _bench import Report, Row, options_of, row, single_threaded
 
@@ -63,9 +64,8 @@ def changed(backend: str) -> float:
     from eyerender.torch import Augment, StreamDataset
 
     parts = ("image", "mask", "pupil", "gaze", "glints", "visible_fraction")
-    stream = StreamDataset(
-        plan(BATCH, SHARD), batch_size=BATCH, parts=parts, size=(128, 128), augment=Augment(), reuse=60, backend=backend
-    )  # type: ignore[arg-type]
+    how: dict[str, Any] = {"parts": parts, "size": (128, 128), "augment": Augment(), "reuse": 60, "backend": backend}
+    stream = StreamDataset(plan(BATCH, SHARD), batch_size=BATCH, **how)
     batches = iter(stream)
     next(batches)  # which renders
     start = time.process_time()

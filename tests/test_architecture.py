@@ -245,7 +245,7 @@ BOUNDS = {
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2650,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 11080,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
+    "dataset": 11090,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3530,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
     "eye": 4290,  # spectacle lenses from prescriptions or as made, their frames; fixation, legs of rays, for the same

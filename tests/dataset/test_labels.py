@@ -7,13 +7,16 @@ import json
 import numpy as np
 import pytest
 
+import eyerender as er
 from eyerender.eye.parts import ConicSpec
 from eyerender.eye.spec import EyeSpec
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder
-from eyerender.imaging.labels import moments_ellipse
+from eyerender.imaging.labels import moments_ellipse, whole_pixels
 from eyerender.optics.ellipse import Ellipse, points_on_ellipse, signed_distance
 from eyerender.scene.spec import SceneSpec
+from tests.support.dataset_specs import plan
+from tests.support.labels import labels_of
 
 pytestmark = pytest.mark.render
 
@@ -41,6 +44,40 @@ def test_the_moments_of_a_drawn_ellipse_give_it_back():
         assert not found["cut"]
     assert moments_ellipse(np.ones((4, 4), bool), (0, 0, 4, 4))["cut"]
     assert moments_ellipse(np.zeros((4, 4), bool), (0, 0, 4, 4))["centre_px"] is None
+
+
+def test_what_lies_outside_the_window_is_unseen():
+    v, u = np.mgrid[:60, :100]
+    whole = np.where(np.hypot(u - 99.5, v - 30) < 25, 3, np.where(np.hypot(u - 99.5, v - 30) < 45, 2, 0)).astype(
+        np.uint8
+    )
+    amodal = {"centre_px": [109.5, 50.0], "angle_rad": 0.3}
+    labels = {"pupil": {"amodal": {**amodal, "semi_axes_px": [25.0, 25.0]}},
+              "iris": {"amodal": {**amodal, "semi_axes_px": [45.0, 45.0]}}}  # fmt: skip
+    # The right half of both is outside, and of the iris what is more than 30 px above or below the middle.
+    stripe = 30 * np.sqrt(45**2 - 30**2) + 45**2 * np.arcsin(30 / 45)
+    for name, part, share in (("pupil", 3, 0.5), ("iris", 2, (stripe / np.pi - 25**2 / 2) / (45**2 - 25**2))):
+        seen = np.count_nonzero(whole == part) / whole_pixels(whole, labels, name, (10, 20, 100, 60))
+        assert seen == pytest.approx(share, abs=0.01)
+    labels["pupil"]["amodal"]["centre_px"] = [60.0, 50.0]  # within the window, its pixels count
+    assert whole_pixels(whole, labels, "pupil", (10, 20, 100, 60)) == np.count_nonzero(whole == 3)
+    nowhere = {"amodal": {"centre_px": None, "semi_axes_px": None, "angle_rad": None}}
+    assert whole_pixels(np.zeros_like(whole), {"pupil": nowhere, "iris": nowhere}, "iris", (0, 0, 100, 60)) == 0
+
+
+def test_a_small_window_says_what_it_cuts_off():
+    lights = [{"position_mm": [615.0, y, 0.0], "radius_mm": 2.5, "intensity_mw_sr": 100.0} for y in (600.0, -600.0)]
+    scene = plan(scene__image__window_px=[16, 16], scene__rig__lights=lights).draw(0).build()
+    (image,) = er.render(scene)
+    labels = labels_of(image)
+    share = labels["pupil"]["visible"]["pixels"] / (np.pi * np.prod(labels["pupil"]["amodal"]["semi_axes_px"]))
+    assert labels["pupil"]["visible_fraction"] == pytest.approx(share)
+    assert share < 0.9
+    assert labels["pupil"]["visible"]["cut"]
+    assert 0 < labels["iris"]["visible_fraction"] < 0.2
+    outside = [glint for glint in labels["glints"] if not glint["in_window"]]
+    assert outside
+    assert {(g["visible"], g["hidden_by"]) for g in outside} == {(False, "outside the picture")}
 
 
 def test_ellipses_hold_the_masks(entries):

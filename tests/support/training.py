@@ -12,6 +12,9 @@ import eyerender as er
 from eyerender.imaging.labels import EyeInWindow, known_labels, moments_ellipse
 from eyerender.imaging.lines import image_line
 from eyerender.optics.ellipse import Ellipse, signed_distance
+from eyerender.region.mesh import lid_margins
+from eyerender.rendering.records.job import globe_of
+from eyerender.rendering.scene.pixels import lid_margins_px
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 
@@ -36,6 +39,7 @@ TREE: dict[str, Any] = {
         "lights": [{"position_mm": [70.0, y, z]} for y, z in ((20.0, -12.0), (-20.0, -12.0), (0.0, -30.0))],
         "screen": {"centre_mm": [650.0, 0.0, 0.0], "size_mm": [377.0, 301.0]},
     },
+    "region": {"blink": 0.2},
     "targets": {"world_mm": [[600.0, -40.0, 90.0]]},
 }
 
@@ -88,15 +92,13 @@ def line_of(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]
         labels[part] |= {"visible": moments_ellipse(inside, view.window), "visible_fraction": 0.8}
     for glint in labels["glints"]:
         glint |= {"visible": glint["in_window"], "spot_xy_px": None}
-    rows = np.linspace(0, 1, 17)[:, None] * [6.0, 1.0]
-    right = scene.spec.subject.eyes == ("right",)
-    along = np.array([w - 1 - 30.0, 40.0]) + rows * [-1, 1] if right else np.array([30.0, 40.0]) + rows
-    labels |= {"lid_margins_px": {"upper": along.tolist(), "lower": (along + np.array([0, 30])).tolist()}}
+    globe = globe_of(view.eye, view.M, view.t - view.apex_mm)
+    labels["lid_margins_px"] = lid_margins_px(lid_margins(scene.spec.region, globe), scene.rig.cameras[0], view.apex_mm)
     labels["lid_opening"] = {"mm": 9.5, "share": 1.1}
     (record,) = found.records()
     line = image_line(scene, record, view.window, labels)
     image = np.random.default_rng(0).integers(0, 65536, (h, w)).astype(np.uint16)
     normals = np.random.default_rng(1).normal(size=(h, w, 3)).astype(np.float32)
-    if right:
+    if scene.spec.subject.eyes == ("right",):
         image, normals = image[:, ::-1], (normals * [-1, 1, 1]).astype(np.float32)[:, ::-1]
     return line, {"images": image, "masks": mask, "normals": normals}

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,7 +168,7 @@ def test_a_split_of_a_stream_is_that_of_the_folder(folder, spec):
 
 
 def test_a_stream_yields_each_picture_again_with_other_changes(spec):
-    options = {"batch_size": 4, "shuffle": 2, "reuse": 3, "lanes": 2, "parts": ("image", "glints", "eye"),
+    options: Any = {"batch_size": 4, "shuffle": 2, "reuse": 3, "lanes": 2, "parts": ("image", "glints", "eye"),
                "size": (48, 40), "augment": Augment(seed=1)}  # fmt: skip
     stream = StreamDataset(spec, **options)
     found = list(stream)

@@ -117,4 +117,4 @@ def _drawn_in(polygon: Floats, part: Bools) -> Floats:
     low, high = np.floor(polygon).astype(int), np.ceil(polygon).astype(int)
     padded = np.pad(part, 1)
     inward = np.where(padded[low[:, 0] + 1, low[:, 1] + 1], -_INSET_PX, _INSET_PX)
-    return polygon + inward[:, None] * (high - low)
+    return np.asarray(polygon + inward[:, None] * (high - low))

@@ -99,13 +99,13 @@ class Augmentation:
     def _recorded(self, rng: np.random.Generator, picture: Singles) -> Singles:
         """Add noise to a picture (h, w), and compress some."""
         noise = rng.standard_normal(picture.shape, dtype=np.float32) * np.float32(rng.uniform(*self.noise))
-        picture = np.clip(picture + noise, 0.0, 1.0)
+        picture = np.clip(picture + noise, 0.0, 1.0).astype(np.float32, copy=False)
         if rng.random() >= self.compression:
             return picture
         file = io.BytesIO()
         codes = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
         codes.save(file, "JPEG", quality=round(rng.uniform(*self.quality)))
-        return np.asarray(Image.open(file), dtype=np.float32) / 255
+        return np.asarray(Image.open(file), dtype=np.float32) / np.float32(255)
 
     def _placement(self, rng: np.random.Generator, own: tuple[int, int], size: tuple[int, int]) -> Placement:
         crop = rng.uniform(*self.crop)

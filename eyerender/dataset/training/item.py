@@ -66,7 +66,7 @@ PARTS = (*PICTURES, *LABELS, "camera", "line")
 LEAST_SHOWN = 0.1
 """Share of the pupil or the iris that must show, so that its labels are valid."""
 
-Picture = Callable[[str], NDArray[Any] | None]
+PixelsOf = Callable[[str], NDArray[Any] | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,7 +115,7 @@ class TrainingItem:
         return np.asarray(((xy >= -0.5) & (xy < np.array(self.size) - 0.5)).all(axis=-1))
 
 
-def part_of(part: str, line: Mapping[str, Any], picture: Picture, *, linear: bool, lights: int | None) -> Any:
+def part_of(part: str, line: Mapping[str, Any], picture: PixelsOf, *, linear: bool, lights: int | None) -> Any:
     """Read a part of a picture from its line and its pixels.
 
     Args:
@@ -139,7 +139,7 @@ def part_of(part: str, line: Mapping[str, Any], picture: Picture, *, linear: boo
     return line if part == "line" else _label(part, line)
 
 
-def pixels_of(kind: str, picture: Picture) -> NDArray[Any]:
+def pixels_of(kind: str, picture: PixelsOf) -> NDArray[Any]:
     """Return the pixels of a kind of picture; raise `KeyError` where there are none."""
     pixels = picture(kind)
     if pixels is None:

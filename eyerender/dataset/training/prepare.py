@@ -9,7 +9,7 @@ from typing import Any
 from ...base.errors import WRONG, InputError
 from ..draws import is_draw
 from .augment import Augmentation
-from .item import PARTS, Picture, TrainingItem, part_of, pixels_of
+from .item import PARTS, PixelsOf, TrainingItem, part_of, pixels_of
 from .place import Placement, mirrored, placed
 from .symmetry import mirrored_lamps
 
@@ -54,7 +54,7 @@ class Preparation:
         """Whether items may be mirrored, and say so."""
         return self.mirror_left or self.augment is not None
 
-    def read(self, line: Mapping[str, Any], picture: Picture, where: str) -> TrainingItem:
+    def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:
         """Read an item; left eyes are mirrored if asked for.
 
         Args:
@@ -66,11 +66,11 @@ class Preparation:
             InputError: a picture or a label is missing or wrong.
         """
         parts: dict[str, Any] = {}
-        part, how = "visible_fraction", {"linear": self.encoding == "linear", "lights": self.lights}
+        part, linear, lights = "visible_fraction", self.encoding == "linear", self.lights
         try:
-            shown = part_of(part, line, picture, **how)
+            shown = part_of(part, line, picture, linear=linear, lights=lights)
             for part in self.parts:
-                parts[part] = part_of(part, line, picture, **how)
+                parts[part] = part_of(part, line, picture, linear=linear, lights=lights)
             part, window, mask = "mask", line["window_px"], parts.get("mask")
             if self.augment is not None and mask is None:
                 mask = pixels_of("masks", picture)
