@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from eyerender.base.errors import InputError
 from eyerender.dataset.training.augment import Augmentation
 from eyerender.dataset.training.item import LABELS, person_names
 from eyerender.dataset.training.place import Placement, placed
 from eyerender.dataset.training.prepare import Preparation, lamps_vary
-from eyerender.dataset.training.symmetry import partners
+from eyerender.dataset.training.symmetry import partners, rig_pose
 from tests.support.training import SIZE, line_of, mirrored_tree, scene_tree
 
 PARTS = ("image", "mask", "normals", *LABELS, "camera")
@@ -66,6 +67,31 @@ def test_a_mirrored_left_eye_is_that_of_the_mirrored_scene(lens, mount, symmetri
     found = differences(mirrored, truth)
     assert max(found.values()) < 1e-9, found
     assert item_of(tree).mirrored is False
+
+
+def test_vectors_in_the_frame_of_a_moved_rig_are_those_that_its_camera_sees():
+    """In its own frame a rig's camera stands where it was built; a pose of the line replaces the mount."""
+    tree = scene_tree()
+    tree["rig"]["mount"] = MOUNT
+    line, pictures = line_of(tree)
+    own = tree["rig"]["cameras"][0]["calibration"]
+    R, t = rig_pose(line)
+    posed = {
+        **line,
+        "rig_pose": {"rotation_rad": Rotation.from_matrix(R).as_rotvec().tolist(), "translation_mm": t.tolist()},
+    }
+    for one in (line, posed):
+        parts = Preparation(parts=PARTS).read(one, pictures.get, "").parts
+        for name in ("gaze", "optic_axis"):
+            np.testing.assert_allclose(parts[f"{name}_rig"] @ np.transpose(own["R"]), parts[name], atol=1e-12)
+            azimuth, elevation = np.radians(parts[f"{name}_deg"])
+            level = np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])
+            np.testing.assert_allclose([*level, np.sin(elevation)], parts[f"{name}_rig"], atol=1e-12)
+        seen = parts["centres_rig_mm"] @ np.transpose(own["R"]) + own["t_mm"]
+        np.testing.assert_allclose(seen, parts["centres_mm"], atol=1e-10)
+    plain = item_of(scene_tree())
+    pose = line_of(scene_tree())[0]["records"][0]["pose"]
+    assert plain.parts["optic_axis_deg"] == pytest.approx([pose["azimuth_deg"], pose["elevation_deg"]], abs=1e-9)
 
 
 def test_moved_labels_are_those_of_the_equivalent_camera():
