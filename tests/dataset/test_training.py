@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.dataset.training.augment import Augmentation
 from eyerender.dataset.training.item import LABELS, person_names
 from eyerender.dataset.training.place import Placement, placed
 from eyerender.dataset.training.prepare import Preparation, lamps_vary
 from eyerender.dataset.training.symmetry import partners, rig_pose
+from eyerender.scene import Scene
+from eyerender.scene.spec import SceneSpec
+from tests.support.labels import labels_of
 from tests.support.training import SIZE, line_of, mirrored_tree, scene_tree
 
 PARTS = ("image", "mask", "normals", *LABELS, "camera")
@@ -67,6 +71,20 @@ def test_a_mirrored_left_eye_is_that_of_the_mirrored_scene(lens, mount, symmetri
     found = differences(mirrored, truth)
     assert max(found.values()) < 1e-9, found
     assert item_of(tree).mirrored is False
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_the_rendered_mask_of_the_mirrored_scene_is_the_mirrored_mask():
+    images = []
+    for tree in (scene_tree(), mirrored_tree(scene_tree(), (1, 0, 2))):
+        del tree["region"]
+        (image,) = er.render(Scene.of(SceneSpec.from_mapping({**tree, "image": {"spp": 1}})))
+        images.append((image.parts, [glint["spot_xy_px"] for glint in labels_of(image)["glints"]]))
+    (mask, spots), (other, mirrored_spots) = images
+    np.testing.assert_array_equal(mask[:, ::-1], other)
+    turned = np.array([SIZE[0] - 1, 0]) + np.array(spots)[[1, 0, 2]] * [-1, 1]
+    np.testing.assert_allclose(turned, mirrored_spots, atol=1e-9)
 
 
 def test_vectors_in_the_frame_of_a_moved_rig_are_those_that_its_camera_sees():
