@@ -20,6 +20,7 @@ from ..base.references import load_reference
 from ..base.spec import file_digest
 from ..base.storage.files import shown
 from ..eye.catalogue import catalogue_names, load_eye
+from ..eye.spec import EyeSpec
 from ..scene import Scene
 from ..scene.spec import SceneSpec
 from .template import Turn
@@ -183,6 +184,9 @@ def given_scene(scene: Any, draws: Mapping[str, Any], base: Path, *, source: str
     part = tree.get("eye")
     if part is None and isinstance(tree.get("subject"), Mapping):
         part = tree["subject"].get("eye")
+    if isinstance(part, Mapping) and part.get("biometry") is not None:
+        made = EyeSpec.from_mapping({"biometry": part["biometry"]}, source=source)
+        return GivenScene(tree=tree, eye=made.to_mapping(), draws=dict(draws))
     model = str(part.get("model", "E2")) if isinstance(part, Mapping) else "E2"
     return GivenScene(tree=tree, eye=dict(_eye_file(model, base)), draws=dict(draws))
 

@@ -505,6 +505,9 @@ def _eye_names(spec: DatasetSpec, source: str) -> list[str]:
     part = spec.scene.get("eye", {})
     if is_draw(part):
         raise InputError("draw single values of the eye, not the whole eye", source=source, path="scene.eye")
+    if isinstance(part, Mapping) and "biometry" in part:
+        reason = "write it to an eye file, and name this file as the model"
+        raise InputError(reason, source=source, path="scene.eye.biometry")
     given = isinstance(part, Mapping) and "model" in part
     if spec.population is not None and not given:
         return []

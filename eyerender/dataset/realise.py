@@ -88,7 +88,7 @@ class Realised:
         spec = self.scene.located()
         drawn = spec.person is not None
         if not drawn:
-            spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": "eye.yaml"})})
+            spec = spec.model_copy(update={"eye": spec.eye.named("eye.yaml")})
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if not drawn:

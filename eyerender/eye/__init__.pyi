@@ -1,4 +1,5 @@
 from .contact import ContactLens as ContactLens
+from .biometry import BiometrySpec as BiometrySpec
 from .kappa import kappa_deg as kappa_deg
 from .kappa import with_kappa as with_kappa
 from .margin import PupilMargin as PupilMargin

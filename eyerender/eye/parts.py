@@ -325,6 +325,11 @@ class EyeParts(FileSpec):
     cornea: tuple[SurfaceSpec, ...] = Field(
         min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
     )
+    toric_axis: Literal["same"] | None = Field(
+        default=None,
+        description="`same`: the front cornea of the left eye has its meridians at the axes of the right one's, as an "
+        "examiner sees them; default: it is the mirror image, so that an axis of 20 deg is one of 160 in the left eye",
+    )
     lens: Lens | None = Field(default=None, description="the lens; without one the eye has a cornea only")
     retina: PlacedSpec = Field(description="the surface on which the fovea lies")
     stop: StopSpec = Field(description="the anatomical pupil")

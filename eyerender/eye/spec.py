@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -9,6 +10,7 @@ from pydantic import model_validator
 
 from ..base.errors import InputError
 from ..base.spec import KeyProblem, Side
+from .biometry import with_biometry
 from .build import build_eye
 from .check import check_eye
 from .model import EyeModel
@@ -28,6 +30,11 @@ class EyeSpec(EyeParts):
         """Read the files of measured points that the shapes name, and replace them by fitted grids."""
         return with_topographies(data, folder)
 
+    @classmethod
+    def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Replace the numbers of a biometer by the keys that follow from them."""
+        return with_biometry(data) if "biometry" in data else data
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         try:
@@ -40,4 +47,9 @@ class EyeSpec(EyeParts):
         self, *, eye: Side = "right", wavelength_nm: float = 850.0, pupil_diameter_mm: float | None = None
     ) -> EyeModel:
         """Build the numeric model at a wavelength (nm) with a pupil (mm; the file's own if None)."""
-        return build_eye(self, eye, wavelength_nm, pupil_diameter_mm)
+        spec = self
+        if eye == "left" and self.toric_axis == "same":
+            x, y, z = self.cornea[0].tilt_deg
+            turned = self.cornea[0].model_copy(update={"tilt_deg": (-x, y, z)})
+            spec = self.model_copy(update={"cornea": (turned, *self.cornea[1:])})
+        return build_eye(spec, eye, wavelength_nm, pupil_diameter_mm)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError
+from ..eye.biometry import iris_root_mm
 from ..eye.build import bare_eye
 from ..eye.check import check_eye
 from ..eye.entrance import stop_for_entrance
@@ -30,10 +31,8 @@ FRONT_Q_PER_D = -0.5
 """Change of the lens per dioptre: thickness 0.058 - 0.0005 y mm, curvatures 0.0077 and 0.0043 /mm, Q (Navarro 2014)."""
 FORWARD = 0.75
 """Share of the lens' thickening that moves its front forward (chosen; Dubbelman et al. 2005, from memory)."""
-_ROOT_GAP_MM = 0.1
 _IRIS_GAP_MM = 0.02
 _SHIFTED_MM = 0.3  # distance by which pupils may move with their size
-_LIMBUS_GAP_MM = 0.35
 _DESIGN_NM = 850.0
 
 
@@ -279,7 +278,5 @@ def _stop_gap(eye: Mapping[str, float]) -> float:
 
 def _iris_root(eye: Mapping[str, float], stop_x: float, limbus: float) -> float:
     """Compute the radius of the iris' root: just inside the posterior cornea in the stop's plane and the limbus."""
-    depth = max(-stop_x - eye["corneal_thickness_mm"], 0.0)
-    radius, q = eye["posterior_steep_mm"], eye["posterior_asphericity"]
-    reach = np.sqrt(max(2.0 * radius * depth - (1.0 + q) * depth**2, 0.0))
-    return float(min(limbus - _LIMBUS_GAP_MM, reach - _ROOT_GAP_MM))
+    depth = -stop_x - eye["corneal_thickness_mm"]
+    return iris_root_mm(eye["posterior_steep_mm"], eye["posterior_asphericity"], depth, limbus)

@@ -54,7 +54,7 @@ def write_report(
     lead = [
         scene.spec.description,
         "The analytic observer computes the apparent pupil and the glints by ray optics through the cornea of eye "
-        f"model {scene.spec.eye.model}. The image observer recovers them from the pixels of the rendered "
+        f"model {scene.eye_name}. The image observer recovers them from the pixels of the rendered "
         f"{scene.spec.wavelength_nm:g} nm images. The same gaze estimator uses both.",
     ]
     write_page(path, Page(title, lead, _cards(comparison, len(entries)), sections))

@@ -242,7 +242,7 @@ class Scene:
             InputError: an eye is not possible or, where a `base` is given, a file does not exist.
         """
         if eye is not None:
-            spec = spec.model_copy(update={"eye": spec.eye.model_copy(update={"model": eye}), "person": None})
+            spec = spec.model_copy(update={"eye": spec.eye.named(eye), "person": None})
         eye_spec = spec.eye.spec(base if eye is None else None)
         return cls.compiled(spec, eye_spec, base=base, source=source)._checked()
 
@@ -305,7 +305,7 @@ class Scene:
         spec = SceneSpec.from_mapping(data)
         # The eye may differ from the one that the scene's file names: one passed in Python, or one with drawn
         # parameters.
-        same = spec.eye.model == self.spec.eye.model
+        same = (spec.eye.model, spec.eye.biometry) == (self.spec.eye.model, self.spec.eye.biometry)
         return self.replaced(spec, eye_spec=None if same else spec.eye.spec(self.base))._checked()
 
     def of_first_eye(self) -> Scene:

@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import (
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from ..base.errors import InputError
 from ..base.spec import EYES, FileSpec, KeyProblem, Positive, Side, Spec, Vec2, Vec3
+from ..eye.biometry import BiometrySpec
 from ..eye.catalogue import load_eye, refuse_unknown
 from ..eye.contact import ContactLenses
 from ..eye.margin import PupilMargin
@@ -55,6 +64,9 @@ class Eye(Spec):
     model: Model = Field(
         default="E2", description="a catalogue name, an eye file (relative to the scene), or the keys of an eye file"
     )
+    biometry: BiometrySpec | None = Field(
+        default=None, description="numbers of a biometer, from which the eye is made, in place of `model`"
+    )
     pupil_diameter_mm: Positive | None = Field(
         default=None, description="diameter of the anatomical pupil; default: the eye file's"
     )
@@ -73,6 +85,18 @@ class Eye(Spec):
             refuse_unknown(model)
         return model
 
+    @model_validator(mode="after")
+    def _one_eye(self) -> Self:
+        if self.biometry is not None and "model" in self.model_fields_set:
+            raise KeyProblem("biometry", "cannot stand beside 'model'; both say which eye it is")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_default(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out the default model, which does not hold beside `biometry`."""
+        found: dict[str, Any] = serialise(self)
+        return found if self.biometry is None else {key: value for key, value in found.items() if key != "model"}
+
     @classmethod
     def load(cls, model: str | EyeSpec, **fields: Any) -> Self:
         """Create an eye and check that it is physically possible.
@@ -90,10 +114,19 @@ class Eye(Spec):
 
     def spec(self, base: Path | None = None) -> EyeSpec:
         """Read the eye's surfaces and media; `base` is the folder that an eye file's name is relative to."""
+        if self.biometry is not None:
+            try:
+                return EyeSpec.from_mapping(self.biometry.keys())
+            except InputError as error:
+                raise error.placed(under="eye.biometry") from None
         if isinstance(self.model, EyeSpec):
             return self.model
         inside = base is not None and self.model.endswith((".yaml", ".yml"))
         return load_eye(str(base / self.model) if base is not None and inside else self.model)
+
+    def named(self, model: str) -> Self:
+        """Copy the settings with another eye: a name of the catalogue or an eye file."""
+        return self.model_copy(update={"model": model, "biometry": None})
 
     def build(self, side: Side = "right", *, wavelength_nm: float = 850.0) -> EyeModel:
         """Build the numeric eye of one side."""
@@ -356,8 +389,9 @@ class SceneSpec(FileSpec):
 def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
     """Add the person drawn from the population to a scene's mapping; keys of the scene take precedence."""
     eye = data.get("eye")
-    if isinstance(eye, Spec) or (isinstance(eye, Mapping) and "model" in eye):
-        raise InputError("cannot stand beside a population, which gives the eyes", path="eye.model")
+    for key in ("model", "biometry"):
+        if isinstance(eye, Spec) or (isinstance(eye, Mapping) and key in eye):
+            raise InputError("cannot stand beside a population, which gives the eyes", path=f"eye.{key}")
     if data.get("person") is not None:
         raise InputError("cannot stand beside a population, which gives the person", path="person")
     given = data["population"]

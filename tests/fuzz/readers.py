@@ -31,6 +31,10 @@ from tests.support.fuzzing import mutated, proper
 
 ROOT = Path(__file__).resolve().parents[2]
 LONGEST_BYTES = 8192
+BIOMETRY = (
+    b"format: 3\nname: a\nbiometry: {k1_d: 43, k1_axis_deg: 20, k2_d: 44.5, acd_mm: 3.4, lens_mm: 4, axial_mm: 24, "
+    b"wtw_mm: 12}\nfovea: {field_deg: [5, 1]}\n"
+)
 
 
 def _scene(path: Path) -> Any:
@@ -322,7 +326,7 @@ def _study(path: Path) -> Any:
 READERS: dict[str, Reader] = {
     "scene": Reader("a.yaml", _scene, lambda: _shipped("scene")),
     "dataset": Reader("a.yaml", _dataset, lambda: _shipped("dataset")),
-    "eye": Reader("a.yaml", _eye, lambda: _shipped("eye")),
+    "eye": Reader("a.yaml", _eye, lambda: [BIOMETRY, *_shipped("eye")]),
     "records": Reader("a.json", _records, record_seeds),
     "table": Reader("a.csv", _table, lambda: [b"x,y,gx,gy\n320.5,240,300,200\n1,2,,nan\n"]),
     "folder": Reader("metadata.jsonl", _folder, folder_seeds, beside_metadata),

@@ -18,6 +18,7 @@ EXCEPTIONS = {
     "dataset.partial.PartialShard._sort_lines": "the lines of this run",
     "dataset.assemble.LineTable._lines": "shards that were just verified",
     "dataset.run.Run._assembled": "a dataset that was just verified",
+    "eye.biometry._adult": "an eye file of the package",
     "OwnEstimator.load": "imports a class that the caller names",
 }
 
