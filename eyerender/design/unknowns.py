@@ -121,7 +121,7 @@ class Unknowns(Spec):
             "toricity_mm": 0.053,
             "pupil_centre_mm": 0.12,
             "ellipticity": 0.0145,
-            "pupil_shift": 0.05,
+            "pupil_shift": 0.04,
             "margin": 0.012,
             "rotation_gap_mm": 0.6,
             "posterior_radius": 0.03,

@@ -156,8 +156,6 @@ def _mapping(
     lens_front = -(eye["chamber_depth_mm"] - FORWARD * thicker)
     stop_x = lens_front + _stop_gap(eye)
     limbus = eye["iris_diameter_mm"] / 2.0
-    direction = np.radians(eye["pupil_shift_direction_deg"])
-    slope = eye["pupil_shift_mm_per_mm"]
     return {
         "name": name,
         "cornea": _cornea(eye),
@@ -173,7 +171,7 @@ def _mapping(
         "stop": {
             "diameter_mm": constant("pupil_reference_mm"),
             "position_mm": [stop_x, eye["pupil_nasal_mm"], eye["pupil_up_mm"]],
-            "shift_mm_per_mm": [float(-slope * np.cos(direction)), float(slope * np.sin(direction))],
+            "shift_mm_per_mm": [eye["pupil_shift_nasal_mm_per_mm"], eye["pupil_shift_up_mm_per_mm"]],
         },
         "limbus_radius_mm": limbus,
         "iris": {"root_radius_mm": _iris_root(eye, stop_x, limbus)},
