@@ -1,5 +1,5 @@
-from .contact import ContactLens as ContactLens
 from .biometry import BiometrySpec as BiometrySpec
+from .contact import ContactLens as ContactLens
 from .kappa import kappa_deg as kappa_deg
 from .kappa import with_kappa as with_kappa
 from .margin import PupilMargin as PupilMargin

@@ -12,7 +12,7 @@ import pytest
 
 from eyerender.analytic.observer import trace
 from eyerender.apps.study import guestrin, head_mounted, observers_compared
-from eyerender.apps.study.conditions import FIXED, PARAMETERS, SHIFTED, TRACKERS, conditions_part, person_part
+from eyerender.apps.study.conditions import FIXED, NOISE_TYPES, PARAMETERS, SHIFTED, TRACKERS, conditions_part, person_part
 from eyerender.apps.study.images import StudyImages, facing_scene
 from eyerender.apps.study.observing import Observing, moved, with_index_of
 from eyerender.apps.study.run import run_study
@@ -302,9 +302,8 @@ def test_conditions(conditions):
         reported = "right eye" if tracker == "model-based" else "both eyes"
         for centre in (FIXED, SHIFTED):
             assert part.diameters[f"{tracker}, {reported}, {centre}"][2] == pytest.approx(own.mean_deg, rel=1e-9)
-        assert part.precision[tracker]["rms_s2s_deg"] / part.precision[tracker]["sd_deg"] == pytest.approx(
-            2**0.5, rel=0.03
-        )
+        for kind, ratio in NOISE_TYPES.items():
+            assert part.precision[tracker][kind]["s2s_over_sd"] == pytest.approx(ratio, rel=0.03)
     assert part.screen_maps["model-based"].shape == (11, 13)
     assert part.screen_maps["interpolation"].shape == (9, 15)
     names = [e["parameter"] for e in part.sensitivity]

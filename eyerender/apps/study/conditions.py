@@ -26,7 +26,7 @@ from ...gaze.guestrin import GuestrinEizenman
 from ...gaze.quality import quality
 from ...gaze.regression import Regression
 from ...scene import Scene
-from ...scene.observation import EYES, Observations
+from ...scene.observation import EYES, WHITE, Observations
 from . import blignaut, guestrin
 from .literature import CALIBRATION_SETS
 from .results import ModelResults, Row, mean_row
@@ -38,12 +38,14 @@ CALIBRATED_MM = 4.0
 DIAMETERS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 HEAD_MM = (-40.0, -20.0, 0.0, 20.0, 40.0)
 GRID = (13, 11)
-NOISE_PX, SAMPLES, SEED = 0.05, 100, 2014
+NOISE_PX, SAMPLES, SEED = 0.05, 200, 2014
+NOISE_TYPES = {"white": WHITE, "filtered": 0.8}
+"""Type of noise -> its RMS-S2S over SD."""
 PEOPLE = 4
 FIXED, SHIFTED = "centre fixed", "centre shifts"
 CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
 """Ways in which the pupil widens -> keys of the scene's eye."""
-QUALITY = ("accuracy_deg", "rms_s2s_deg", "sd_deg")
+QUALITY = ("accuracy_deg", "rms_s2s_deg", "sd_deg", "s2s_over_sd")
 
 
 def _with_lens(axis: int) -> str:
@@ -88,7 +90,8 @@ class ConditionsPart(ModelResults):
     diameters: dict[str, list[float]] = field(default_factory=dict)
     """Mean errors over `DIAMETERS_MM`, by name of the curve: tracker, eyes, and how the pupil widens."""
     sensitivity: list[dict[str, Any]] = field(default_factory=list)
-    precision: dict[str, dict[str, float]] = field(default_factory=dict)
+    precision: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    """Accuracy and precision, by tracker and type of noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +149,7 @@ def conditions_part(eye: str) -> ConditionsPart:
         curves, pupil_rows = _over_diameters(tracker, eye, sides=("both", EYES[0]))
         out.diameters |= curves
         out.rows += pupil_rows
-        out.precision[name] = _precision(tracker, seen)
+        out.precision[name] = {kind: _precision(tracker, seen, ratio) for kind, ratio in NOISE_TYPES.items()}
     base = {name: _mean(_scene(name, eye)) for name in TRACKERS}
     for label, paths, step, unit in PARAMETERS:
         own = _scene(TRACKERS[0], eye).eye_spec
@@ -245,12 +248,15 @@ def _over_heads(tracker: _Tracker, keys: dict[str, Any]) -> tuple[Floats, list[R
         return errors.mean(axis=1).reshape(len(HEAD_MM), len(HEAD_MM)), rows
 
 
-def _precision(tracker: _Tracker, seen: Observations) -> dict[str, float]:
-    """Compute accuracy and precision with Gaussian noise on the features, averaged over the fixations."""
-    rng = np.random.default_rng(SEED)
+def _precision(tracker: _Tracker, seen: Observations, s2s_over_sd: float) -> dict[str, float]:
+    """Compute accuracy and precision with noise of a type on the features, averaged over the fixations."""
+    rows = np.argsort(seen.index.fixation, kind="stable").reshape(len(np.unique(seen.index.fixation)), 1, -1)
+    order = np.broadcast_to(rows, (len(rows), SAMPLES, rows.shape[2]))
+    noisy = seen.take(order.ravel()).with_noise(NOISE_PX, SEED, s2s_over_sd=s2s_over_sd)
+    place = np.arange(order.size).reshape(order.shape)
     samples = []
-    for _ in range(SAMPLES):
-        frames, points = tracker.points(seen.with_noise(NOISE_PX, rng))
+    for k in range(SAMPLES):
+        frames, points = tracker.points(noisy.take(place[:, k].ravel()))
         samples.append(points)
     found = quality(np.stack(samples), frames.index.target_mm, tracker.from_mm(frames))
     return {name: float(np.nanmean(getattr(found, name))) for name in QUALITY}

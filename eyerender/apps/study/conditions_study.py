@@ -69,7 +69,7 @@ class ConditionsStudy(Study):
         people = [p for p in parts if p.person is not None]
         return {
             "trackers": _WHO,
-            "noise": {"sigma_px": c.NOISE_PX, "samples": c.SAMPLES, "seed": c.SEED},
+            "noise": {"sigma_px": c.NOISE_PX, "types": c.NOISE_TYPES, "samples": c.SAMPLES, "seed": c.SEED},
             "head_positions_mm": list(c.HEAD_MM),
             "pupil_diameters_mm": list(c.DIAMETERS_MM),
             "models": [
@@ -172,19 +172,21 @@ def _sensitivity(parts: Sequence[ConditionsPart]) -> Section:
 
 
 def _precision(parts: Sequence[ConditionsPart]) -> Section:
-    rows = [{"tracker": t, "eye": p.eye_model, **p.precision[t]} for t in c.TRACKERS for p in parts]
+    rows = [
+        {"tracker": t, "eye": p.eye_model, "noise": kind, **p.precision[t][kind]}
+        for t in c.TRACKERS
+        for p in parts
+        for kind in c.NOISE_TYPES
+    ]
+    types = ", ".join(f"{ratio:.3g} for {kind} noise" for kind, ratio in c.NOISE_TYPES.items())
+    names = ("tracker", "eye model", "noise", "accuracy", "RMS-S2S", "SD", "RMS-S2S / SD")
     return Section(
         "Accuracy and precision",
         f"Pupil centres and glints have Gaussian noise of {c.NOISE_PX:g} px in x and y, with {c.SAMPLES} samples per "
         f"fixation and seed {c.SEED}. Accuracy is the angle from the target to the mean estimate. RMS-S2S is the root "
-        "mean square angle between successive samples. SD is the standard deviation about the mean. The table gives "
-        "means over all fixations, in degrees.",
-        table_of(
-            rows,
-            dict(
-                zip(("tracker", "eye model", "accuracy", "RMS-S2S", "SD"), ("tracker", "eye", *c.QUALITY), strict=True)
-            ),
-        ),
+        "mean square angle between successive samples. SD is the standard deviation about the mean. Their ratio tells "
+        f"the type of the noise: {types}. The table gives means over all fixations, in degrees.",
+        table_of(rows, dict(zip(names, ("tracker", "eye", "noise", *c.QUALITY), strict=True))),
     )
 
 
