@@ -3,8 +3,8 @@
 Pupil Labs' pye3d on simulated eyes
 ===================================
 
-pye3d fits a sphere with a pupil to the ellipses of many frames. This script gives it exact ellipses and compares what it
-finds with what is there: the direction of gaze, the centre of the globe and the diameter of the pupil. The eyes are
+pye3d fits a sphere with a pupil to the ellipses of many frames. This script gives it exact ellipses and compares what
+it finds with what is there: the direction of gaze, the centre of the globe and the diameter of the pupil. The eyes are
 pye3d's own schematic eye, and drawn adults.
 
 pye3d 0.3.2 needs NumPy 1, so it has an environment of its own. The two share the files that ``eyerender features``
@@ -62,7 +62,8 @@ def make(folder: Path) -> None:
     people = {f"adult_{k}": {"population": {"preset": "adults", "seed": 60, "subject": k}} for k in range(ADULTS)}
     for name, who in ({"schematic": {"eye": {"model": SCHEMATIC}}} | people).items():
         scene = {
-            "format": 2, "name": name, **who, "subject": {"eyes": ["right"]}, "rig": {"cameras": [CAMERA], "lights": [LIGHT]},
+            "format": 2, "name": name, **who, "subject": {"eyes": ["right"]},
+            "rig": {"cameras": [CAMERA], "lights": [LIGHT]},
             "poses": [{"azimuth_deg": azimuth, "elevation_deg": elevation} for azimuth, elevation in GAZE_DEG],
         }  # fmt: skip
         path = folder / f"{name}.yaml"

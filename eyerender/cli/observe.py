@@ -30,7 +30,7 @@ def features(
     *,
     eye: EyeModel = None,
     points: int = 30,
-    purkinje: Annotated[tuple[int, ...], Parameter(consume_multiple=True)] = (),
+    purkinje: Annotated[tuple[int, ...] | None, Parameter(consume_multiple=True)] = None,
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -50,6 +50,8 @@ def features(
         raise InputError(f"must be >= 6, not {points}", source="--points")
     if points > MAX_BOUNDARY_POINTS:
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
+    if purkinje == ():
+        raise InputError("needs numbers of Purkinje images, 1 to 4", source="--purkinje")
     heed = Heed(strict)
     loaded = heed.scene(scene, eye=eye)
     frames = loaded.frames()
@@ -131,9 +133,9 @@ def extract(
         if value is not None and needed not in (f"--method {method}", f"--eyes {eyes}"):
             raise InputError(f"belongs to {needed}", source=f"--{name}")
     settings = _settings(radius_px, min_confidence, method=method, polarity=polarity, **special)
-    observer = ImageObserver(
-        gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera, rois=_rois(roi, eyes)
-    )
+    rois = _rois(roi, eyes)
+    heed(_exchanged(rois, stacked=arrangement == "stacked"))
+    observer = ImageObserver(gamma=1.0 if gamma is None else gamma, settings=settings, camera=camera, rois=rois)
     if output is not None:
         refuse_special(output)
         if output.suffix.lower() in (".xlsx", ".xls", ".ods"):
@@ -198,6 +200,28 @@ def _rois(values: Sequence[str], eyes: int) -> tuple[SearchRegion, ...]:
         needed = "X Y WIDTH HEIGHT or a mask picture" + (" for each of two eyes" if eyes == 2 else "")
         raise InputError(f"must be {needed}, not {' '.join(values)}", source="--roi")
     return tuple((x, y, w, h) for x, y, w, h in zip(*(numbers[k::4] for k in range(4)), strict=True))
+
+
+def _exchanged(rois: Sequence[SearchRegion], *, stacked: bool) -> list[InputWarning]:
+    """Warn of the regions of two eyes in the wrong order."""
+    if len(rois) != 2:
+        return []
+    axis = 1 if stacked else 0
+
+    def middle(one: SearchRegion) -> float:
+        if not isinstance(one, np.ndarray):
+            return float(one[axis] + one[axis + 2] / 2)
+        places = np.nonzero(one)[1 - axis]
+        return float(places.mean()) if len(places) else np.nan
+
+    middles = [middle(one) for one in rois]
+    if not middles[0] > middles[1]:
+        return []
+    where, first = ("below", "upper") if stacked else ("right of", "left")
+    reason = (
+        f"the first region lies {where} the second; the {first} one comes first, or the eyes have each other's names"
+    )
+    return [InputWarning(code="roi", reason=reason, source="--roi")]
 
 
 def _check_extract(images: Sequence[Path], gamma: float | None, eyes: int) -> None:

@@ -63,10 +63,13 @@ def rig(
     if output is None:
         raise InputError("is needed for one rig", source="--output")
     with progress("rig") as steps:
-        found = run_rig(
-            loaded[0], everyone, output, size, unknowns=given, tolerances=allowed, overwrite=overwrite,
-            progress=steps,
-        )  # fmt: skip
+        try:
+            found = run_rig(
+                loaded[0], everyone, output, size, unknowns=given, tolerances=allowed, overwrite=overwrite,
+                progress=steps,
+            )  # fmt: skip
+        except InputError as error:
+            raise error.placed(source=str(tolerances) if error.path.startswith("tolerances.") else "") from None
     emit(found, f"{_text(found)}\n\nreport: {output / REPORT}", json)
     return 0
 

@@ -62,23 +62,28 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
 
     Args:
         samples_mm: (s, n, 3) s >= 2 samples of n fixations, in time order; NaN without an estimate.
-        target_mm: (n, 3) targets.
+        target_mm: (n, 3) or (3,) targets.
         from_mm: (n, 3) or (3,) vertex of the angles, usually the eye.
 
     Raises:
-        InputError: the samples have another shape, or there are fewer than two of each fixation.
+        InputError: an array has another shape, or there are fewer than two samples of each fixation.
     """
-    samples = np.asarray(samples_mm, dtype=float)
+    samples = _numbers("samples_mm", samples_mm)
     if samples.ndim != 3 or samples.shape[2] != 3 or len(samples) < 2:
-        raise InputError("precision needs at least two samples of each fixation", path="samples_mm")
+        reason = f"must have the shape (s, n, 3) with at least two samples s of each fixation, not {samples.shape}"
+        raise InputError(reason, path="samples_mm")
+    target, origin = (
+        _numbers(name, one, ((samples.shape[1], 3), (3,)))
+        for name, one in (("target_mm", target_mm), ("from_mm", from_mm))
+    )
     here = np.isfinite(samples).all(axis=2)
     count = here.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(here[..., None], samples, 0.0).sum(axis=0) / count[:, None]
-        steps = angular_error_deg(samples[1:], samples[:-1], from_mm)
-        spread = np.where(here, angular_error_deg(samples, mean, from_mm), 0.0)
-        middle = np.broadcast_to(mean - from_mm, samples.shape).reshape(-1, 3)
-        way = np.asarray(samples - from_mm).reshape(-1, 3)
+        steps = angular_error_deg(samples[1:], samples[:-1], origin)
+        spread = np.where(here, angular_error_deg(samples, mean, origin), 0.0)
+        middle = np.broadcast_to(mean - origin, samples.shape).reshape(-1, 3)
+        way = np.asarray(samples - origin).reshape(-1, 3)
         way = way / np.linalg.norm(way, axis=1, keepdims=True)
         away = error_vectors_deg(way, middle).reshape(*samples.shape[:2], 2)
         away = np.where(here[..., None], away, 0.0)
@@ -87,7 +92,7 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
         both = here[1:] & here[:-1]
         several = count >= 2
         return Quality(
-            accuracy_deg=frozen(angular_error_deg(mean, target_mm, from_mm)),
+            accuracy_deg=frozen(angular_error_deg(mean, target, origin)),
             rms_s2s_deg=frozen(np.sqrt(np.where(both, steps**2, 0.0).sum(axis=0) / both.sum(axis=0))),
             sd_deg=frozen(np.where(several, np.sqrt((spread**2).sum(axis=0) / (count - 1)), np.nan)),
             bcea_deg2=frozen(
@@ -95,3 +100,13 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
             ),
             data_loss=frozen(1.0 - count / len(samples)),
         )
+
+
+def _numbers(name: str, values: ArrayLike, shapes: tuple[tuple[int, ...], ...] = ()) -> Floats:
+    try:
+        found = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("must be an array of numbers", path=name) from None
+    if shapes and found.shape not in shapes:
+        raise InputError(f"must have the shape {' or '.join(map(str, shapes))}, not {found.shape}", path=name)
+    return found

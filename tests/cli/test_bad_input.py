@@ -180,6 +180,7 @@ TABLE = [
     (["features", "quickstart", "--points", "many"], 2, "--points"),
     (["features", "quickstart", "--json", "no/such/folder/f.json"], 2, "the folder no/such/folder does not exist"),
     (["features", "quickstart", "--nonsense"], 2, "--nonsense"),
+    (["features", "quickstart", "--purkinje"], 2, "--purkinje: needs numbers of Purkinje images, 1 to 4"),
     (["features", "quickstart", "--purkinje", "4"], 2, "purkinje: must be among 1: E2 has no other Purkinje images"),
     (["eyes", "E9"], 2, "E9: no such eye; the catalogue holds E1, E2"),
     (["eyes", "text.yaml"], 2, "text.yaml: line 2: not valid YAML"),

@@ -157,4 +157,5 @@ def test_the_command(tmp_path, capsys):
         error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
         assert len(error) == 1
         assert reason in error[0]
+        assert error[0].startswith(f"error: {path}: tolerances.0")
         assert not (tmp_path / "no").exists()

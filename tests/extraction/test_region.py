@@ -81,6 +81,16 @@ def test_the_command_takes_rectangles_and_mask_pictures(file, two_eyes, tmp_path
         np.testing.assert_allclose(found, centres, atol=0.1)
 
 
+def test_regions_of_the_eyes_in_the_other_order_are_warned_of(file, tmp_path, capsys):
+    masks = [str(tmp_path / name) for name in ("right.png", "left.png")]
+    for name, part in zip(masks, (slice(320, 640), slice(0, 320)), strict=True):
+        assert cv2.imwrite(name, _mask(part))
+    for regions in (masks, ["320", "0", "320", "240", "0", "0", "320", "240"]):
+        assert run(["extract", str(file), "--eyes", "2", "--roi", *regions, "--json", str(tmp_path / "e.json")]) == 0
+        assert "warning: --roi: the first region lies right of the second" in capsys.readouterr().err
+        assert [one["code"] for one in json.loads((tmp_path / "e.json").read_text())["warnings"]] == ["roi"]
+
+
 @pytest.mark.parametrize(
     ("values", "reason"),
     [

@@ -169,3 +169,19 @@ def test_table_2_is_of_the_vector_itself_not_of_its_deviation():
     assert np.abs(other.point_mm - wanted).max() > 1.0
     closed = [Regression("R3", centred=c).fit(moved, RIG).predict(moved, RIG) for c in (True, False)]
     np.testing.assert_allclose(closed[0].point_mm, closed[1].point_mm, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples_mm": np.zeros((1, 2, 3))}, r"^samples_mm: must have the shape \(s, n, 3\) .* not \(1, 2, 3\)$"),
+        ({"samples_mm": np.zeros((9, 3))}, r"^samples_mm: .* not \(9, 3\)$"),
+        ({"samples_mm": [["a"]]}, "^samples_mm: must be an array of numbers$"),
+        ({"target_mm": np.zeros((3, 3))}, r"^target_mm: must have the shape \(2, 3\) or \(3,\), not \(3, 3\)$"),
+        ({"from_mm": [0.0, 1.0]}, r"^from_mm: .* not \(2,\)$"),
+    ],
+)
+def test_arrays_of_other_shapes_are_refused_in_one_line(change, message):
+    good = {"samples_mm": np.ones((9, 2, 3)), "target_mm": np.ones((2, 3)), "from_mm": np.zeros(3)}
+    with pytest.raises(InputError, match=message):
+        quality(**{**good, **change})

@@ -12,7 +12,15 @@ import pytest
 
 from eyerender.analytic.observer import trace
 from eyerender.apps.study import guestrin, head_mounted, observers_compared
-from eyerender.apps.study.conditions import FIXED, NOISE_TYPES, PARAMETERS, SHIFTED, TRACKERS, conditions_part, person_part
+from eyerender.apps.study.conditions import (
+    FIXED,
+    NOISE_TYPES,
+    PARAMETERS,
+    SHIFTED,
+    TRACKERS,
+    conditions_part,
+    person_part,
+)
 from eyerender.apps.study.images import StudyImages, facing_scene
 from eyerender.apps.study.observing import Observing, moved, with_index_of
 from eyerender.apps.study.run import run_study
