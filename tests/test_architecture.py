@@ -248,7 +248,7 @@ BOUNDS = {
     "dataset": 11090,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3530,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
-    "eye": 4290,  # spectacle lenses from prescriptions or as made, their frames; fixation, legs of rays, for the same
+    "eye": 4415,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1850,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5410,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 2385,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
@@ -258,7 +258,7 @@ BOUNDS = {
     "rendering": 12840,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
     "report": 980,
     "rig": 3950,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
-    "scene": 2410,  # people, times and lens reflections in records; cameras past lenses; refusals where written
+    "scene": 2440,  # people, times and lens reflections in records; cameras past lenses; refusals where written
 }
 
 

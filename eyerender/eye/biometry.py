@@ -30,7 +30,7 @@ ROOT_GAP_MM, LIMBUS_GAP_MM = 0.1, 0.35
 _DEEPER_PER_MM = 0.5
 _MEASURED = ("cornea", "lens", "retina", "limbus_radius_mm", "toric_axis")
 
-Power = Annotated[float, Field(ge=20.0, le=80.0)]
+Keratometry = Annotated[float, Field(ge=20.0, le=80.0)]
 
 
 class BiometrySpec(Spec):
@@ -40,11 +40,11 @@ class BiometrySpec(Spec):
     44.0
     """
 
-    k1_d: Power = Field(description="power of one principal meridian of the cornea, with the index 1.3375")
+    k1_d: Keratometry = Field(description="power of one principal meridian of the cornea, with the index 1.3375")
     k1_axis_deg: float = Field(
         ge=0.0, le=180.0, description="axis of this meridian as the examiner sees it, in the same sense for both eyes"
     )
-    k2_d: Power = Field(description="power of the meridian across it")
+    k2_d: Keratometry = Field(description="power of the meridian across it")
     acd_mm: float = Field(ge=1.0, le=8.0, description="from the front of the cornea to the lens")
     lens_mm: float = Field(ge=1.0, le=8.0, description="thickness of the lens")
     axial_mm: float = Field(ge=14.0, le=40.0, description="from the front of the cornea to the retina")

@@ -51,11 +51,10 @@ def lengths(eye):
 def test_the_numbers_are_read_back_by_rays_in_both_eyes(side, axis):
     eye = er.Eye(biometry={**NUMBERS, "k1_axis_deg": axis})
     powers, axes = keratometry(eye, side)
-    assert powers == pytest.approx([42.5, 44.25], abs=0.01)
-    assert axes == pytest.approx([axis, (axis + 90) % 180], abs=0.1)
+    assert np.abs(powers - [42.5, 44.25]).max() < 0.01
+    assert np.abs((axes - [axis, axis + 90] + 90) % 180 - 90).max() < 0.1
     front, _, lens, back, retina = lengths(eye.build(side))
-    assert front == pytest.approx(0, abs=1e-9)
-    assert [lens, back - lens, retina] == pytest.approx([3.31, 3.87, 24.42], abs=1e-6)
+    assert np.abs([front, lens - 3.31, back - lens - 3.87, retina - 24.42]).max() < 1e-6
     assert 2 * eye.build(side).limbus_radius_mm == 11.9
 
 
