@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from eyerender.eye.spec import EyeSpec
 from tests.support.paths import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
@@ -58,3 +60,14 @@ def test_examples_are_numbered_and_explain_themselves():
         assert set(rule) == {"="}
         assert len(text.splitlines()) < 80
         assert any(rest)
+
+
+def test_the_schematic_eye_of_pye3d_has_its_measures():
+    """A stop 10.392 mm before the centre of the globe, and a cornea of 7.8 mm; both spheres end at the limbus."""
+    eye = EyeSpec.from_mapping(runpy.run_path(str(ROOT / "examples" / "pye3d.py"))["SCHEMATIC"]).build()
+    centre = eye.rotation.azimuth_centre_mm
+    assert eye.stop.centre_mm[0] - centre[0] == pytest.approx(10.392, abs=1e-3)
+    assert eye.front_indices == (1.3375,)
+    limbus = np.array([eye.stop.centre_mm[0], eye.limbus_radius_mm])
+    assert np.linalg.norm(limbus - [centre[0], 0.0]) == pytest.approx(eye.sclera.radius_mm)
+    assert np.linalg.norm(limbus - [-7.8, 0.0]) == pytest.approx(7.8)

@@ -166,3 +166,30 @@ def test_wrong_populations_name_the_key(fields, message):
 def test_conditions_that_hardly_anybody_meets_are_refused():
     with pytest.raises(er.InputError, match="meets the conditions"):
         er.Population("adults", where={"axial_length_mm": (35.0, 36.0)}).draw(1)
+
+
+def test_pupils_shift_with_their_size_in_all_directions():
+    """Yang, Thompson and Burns 2002: 0.060 +- 0.032 mm per mm; most pupils move temporally as they dilate, not all."""
+    people = er.Population("adults").draw(20_000, 8)
+    nasal, up = people["pupil_shift_nasal_mm_per_mm"], people["pupil_shift_up_mm_per_mm"]
+    size = np.hypot(nasal, up)
+    assert size.mean() == pytest.approx(0.060, abs=0.002)
+    assert size.std() == pytest.approx(0.032, abs=0.003)
+    assert np.mean(nasal > 0) == pytest.approx(0.16, abs=0.01)
+    # Eyes are mirror images, so the pair converges or diverges by the sum.
+    assert 0.05 < np.mean(nasal.sum(axis=1) > 0) < 0.25
+
+
+def test_lengths_radii_and_refractions_correlate_as_in_samples_of_adults():
+    """95 % intervals: Iyamu et al. 2011 (70 young adults), and 723 people from 55 years on (Olsen et al. 2007)."""
+    for preset, pairs in {
+        "adults": {"ratio": (-0.86, -0.67)},
+        "elderly": {"length": (-0.636, -0.540), "radius": (0.088, 0.230)},
+    }.items():
+        people = er.Population(preset).draw(20_000, 3)
+        length, radius, refraction = (
+            people[name][:, 0] for name in ("axial_length_mm", "corneal_radius_mm", "refraction_d")
+        )
+        values = {"ratio": length / radius, "length": length, "radius": radius}
+        for name, (low, high) in pairs.items():
+            assert low < np.asarray(np.corrcoef(values[name], refraction))[0, 1] < high, (preset, name)
