@@ -163,7 +163,7 @@ class EyeFit(ArrayValue):
         Raises:
             InputError: the eye is physically impossible, for instance with a pupil in front of the cornea.
         """
-        return changed_file(self.prior, self.theta[0])
+        return changed_file(self.prior.of_side("left" if self.eye == "left" else "right"), self.theta[0])
 
     @property
     def chi2_per_degree(self) -> float:

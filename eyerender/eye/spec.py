@@ -47,9 +47,12 @@ class EyeSpec(EyeParts):
         self, *, eye: Side = "right", wavelength_nm: float = 850.0, pupil_diameter_mm: float | None = None
     ) -> EyeModel:
         """Build the numeric model at a wavelength (nm) with a pupil (mm; the file's own if None)."""
-        spec = self
-        if eye == "left" and self.toric_axis == "same":
-            x, y, z = self.cornea[0].tilt_deg
-            turned = self.cornea[0].model_copy(update={"tilt_deg": (-x, y, z)})
-            spec = self.model_copy(update={"cornea": (turned, *self.cornea[1:])})
-        return build_eye(spec, eye, wavelength_nm, pupil_diameter_mm)
+        return build_eye(self.of_side(eye), eye, wavelength_nm, pupil_diameter_mm)
+
+    def of_side(self, side: Side) -> Self:
+        """Return the eye whose mirror image is the left one, also where `toric_axis` says that this one is not."""
+        if side == "right" or self.toric_axis is None:
+            return self
+        x, y, z = self.cornea[0].tilt_deg
+        turned = self.cornea[0].model_copy(update={"tilt_deg": (-x, y, z)})
+        return self.model_copy(update={"cornea": (turned, *self.cornea[1:]), "toric_axis": None})

@@ -82,6 +82,17 @@ def test_a_toric_eye_file_is_mirrored_unless_it_says_otherwise(tmp_path):
     assert keratometry(er.Eye(mirrored), "left")[1][0] == pytest.approx(160, abs=0.1)
 
 
+@pytest.mark.slow
+def test_the_file_of_a_fitted_left_eye_is_that_of_the_left_eye():
+    """From exact features and from its own eye, a fit finds no change, so that the file has the same left eye."""
+    eye = er.Eye(biometry=NUMBERS)
+    frames = er.Subject(eye, eyes=["left"]).fixating(
+        [[1000, 31.5, 0], [1000, 131.5, 80]], er.load_scene("headset").spec.rig
+    )
+    (fit,) = er.fit_eye(er.trace(frames), frames.scene.rig, prior=eye.spec())
+    assert keratometry(er.Eye(fit.spec), "left")[1][0] == pytest.approx(20, abs=0.5)
+
+
 def test_other_keys_of_an_eye_file_stay():
     eye = EyeSpec.from_mapping({"biometry": NUMBERS, "name": "A", "fovea": {"field_deg": [5.0, 1.0]}})
     assert (eye.name, eye.fovea.field_deg) == ("A", (5.0, 1.0))
