@@ -248,7 +248,7 @@ BOUNDS = {
     "dataset": 11090,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3530,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 7150,
-    "eye": 4415,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
+    "eye": 4420,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1850,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5410,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 2385,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide

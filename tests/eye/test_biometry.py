@@ -8,6 +8,8 @@ import yaml
 
 import eyerender as er
 from eyerender.base.status import Status
+from eyerender.dataset.ownscenes import given_scene
+from eyerender.dataset.plan import Plan
 from eyerender.eye.landmarks import path_to_retina
 from eyerender.eye.spec import EyeSpec
 from eyerender.optics.trace import trace
@@ -118,3 +120,13 @@ def test_biometry_stands_beside_no_other_eye():
         er.Eye("E4", biometry=NUMBERS)
     with pytest.raises(er.InputError, match=r"^retina: cannot stand beside 'biometry'"):
         EyeSpec.from_mapping({"biometry": NUMBERS, "retina": {}})
+
+
+def test_datasets_name_an_eye_file_and_own_scenes_keep_their_eye(tmp_path):
+    scene = er.load_scene("headset").with_({"eye": {"biometry": NUMBERS}})
+    spec = {"format": 3, "kind": "dataset", "name": "d", "count": 1, "scene": scene.spec.to_mapping()}
+    with pytest.raises(er.InputError, match=r"scene.eye.biometry: write it to an eye file"):
+        Plan.of(er.DatasetSpec.from_mapping(spec))
+    for given in (scene, scene.spec, scene.spec.to_mapping()):
+        made = given_scene(given, {}, tmp_path)
+        assert EyeSpec.from_mapping(made.eye) == scene.eye_spec
