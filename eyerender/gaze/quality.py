@@ -76,7 +76,7 @@ def quality(samples_mm: ArrayLike, target_mm: ArrayLike, from_mm: ArrayLike) -> 
         _numbers(name, one, ((samples.shape[1], 3), (3,)))
         for name, one in (("target_mm", target_mm), ("from_mm", from_mm))
     )
-    here = np.isfinite(samples).all(axis=2)
+    here = np.asarray(np.isfinite(samples).all(axis=2))
     count = here.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(here[..., None], samples, 0.0).sum(axis=0) / count[:, None]
