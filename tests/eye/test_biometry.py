@@ -30,8 +30,8 @@ def keratometry(eye, side):
     angle = 2 * np.pi * np.arange(LAMPS) / LAMPS
     ring = RING_MM * np.column_stack([np.cos(angle), np.sin(angle)])
     camera = er.Camera(position_mm=(FAR_MM, 0, 0), look_at_mm=(0, 0, 0), focal_length_px=1e5, resolution_px=(800, 800))
-    lamps = [er.Led((FAR_MM, y, z)) for y, z in ring]
-    rig = er.Rig(cameras=[camera], lights=lamps)
+    lamps = tuple(er.Led((FAR_MM, y, z)) for y, z in ring)
+    rig = er.Rig(cameras=(camera,), lights=lamps)
     seen = er.trace(er.Subject.one_eye(eye, side=side).looking((0, 0), rig))
     assert (seen.glints.status == Status.OK).all()
     # Seen from the front, the subject's left (+y) is to the right and up (+z) is up in the picture.
