@@ -28,6 +28,7 @@ KERATOMETRIC_MM_D = 337.5
 """Radius (mm) times power (D) of keratometers: 1000 (1.3375 - 1)."""
 ROOT_GAP_MM, LIMBUS_GAP_MM = 0.1, 0.35
 _DEEPER_PER_MM = 0.5
+_ADULT = Path(__file__).parent / "catalogue" / "adult.yaml"
 _MEASURED = ("cornea", "lens", "retina", "limbus_radius_mm", "toric_axis")
 
 Keratometry = Annotated[float, Field(ge=20.0, le=80.0)]
@@ -92,7 +93,7 @@ def with_biometry(data: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _adult() -> dict[str, Any]:
-    return read_yaml(Path(__file__).parent / "catalogue" / "adult.yaml")
+    return read_yaml(_ADULT)
 
 
 def iris_root_mm(radius_mm: float, conic_constant: float, depth_mm: float, limbus_mm: float) -> float:
