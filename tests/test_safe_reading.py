@@ -53,7 +53,7 @@ EXCEPTIONS = {
     "folders.imagefile.array_of: archive.open": "a member, of which no more is unpacked than its array has",
     "folders.imagefile.picture_bytes: zipfile.ZipFile": "a new file in memory",
     "region.head._picture: Image.open": "an opened file",
-    "region.meshfile.read_objects: trimesh.load_scene": "bytes that were read",
+    "optics.meshfile.read_objects: trimesh.load_scene": "bytes that were read",
     "rig.opencv._archive: np.load": "bytes that were read",
     "rig.opencv._archive: zipfile.ZipFile": "bytes that were read",
     "base.storage.files.link_or_copy: open": "a file of this run, which is copied where it cannot be linked",

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from ..base.jit import RAYS, compile_share, ensure_compiled
 from ..eye import pose_kernels
-from ..optics import ellipse_kernels, fermat_kernels, graph_kernels
+from ..optics import ellipse_kernels, fermat_kernels, graph_kernels, triangle_kernels
 from . import view_kernels
 
-MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, pose_kernels, view_kernels)
+MODULES = (graph_kernels, ellipse_kernels, fermat_kernels, pose_kernels, triangle_kernels, view_kernels)
 """Modules with compiled functions of the ray optics."""
 
 if __name__ == "__main__":

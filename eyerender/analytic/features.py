@@ -25,6 +25,7 @@ from ..optics.surfaces import Xyz
 from ..rig.camera import PinholeCamera
 from ..rig.distortion import is_distorted
 from ..scene.observation import MAX_BOUNDARY_POINTS, MAX_POINTS
+from .occluders import Occluders
 from .rays import glint_exits, pupil_exits
 from .view_kernels import project_all, see_all
 
@@ -96,6 +97,7 @@ def features(
     lit: npt.ArrayLike = True,
     boundary_points: int = 30,
     purkinje: Sequence[int] = (1,),
+    occluders: Occluders | None = None,
 ) -> Features:
     """Compute the features of n eyes.
 
@@ -110,6 +112,8 @@ def features(
         lit: (n, m) whether a light lights the eye; if not, its images have status NONE.
         boundary_points: number of boundary points, >= 6.
         purkinje: orders of the requested images of each light; one that an eye lacks has status MISSED.
+        occluders: what hides features besides the eye itself. Light that enters the eye is followed from its lamp to
+            the point where it leaves.
     """
     _check_options(len(np.atleast_1d(eye_index)), boundary_points, purkinje)
     which = np.asarray(eye_index, dtype=np.intp)
@@ -136,6 +140,8 @@ def features(
                         turned, order, view.into_eye(lights[some]), view.camera_mm, view.lenses
                     )
                     pixels, status = view.project(exits, status)
+                    if occluders is not None:
+                        occluders.mark(status, pixels, view.in_world(exits), camera, lights[some])
                     at, lamp = np.ix_(block, some)
                     glints[at, lamp, j], glint_status[at, lamp, j] = pixels, status
                     glint_residual[at, lamp, j], glint_in_image[at, lamp, j] = residual, camera.in_image(pixels)
@@ -144,6 +150,9 @@ def features(
                     # The last point is the stop's centre.
                     exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm, near.lenses)
                     pixels, status = near.project(exits, status)
+                    if occluders is not None:  # the centre is no feature that is seen
+                        outline = near.in_world(exits)[:, :-1]
+                        occluders.mark(status[:, :-1], pixels[:, :-1], outline, camera, None)
                     points[part], anatomical[part] = pixels[:, :-1], pixels[:, -1]
                     point_status[part], point_residual[part] = status[:, :-1], residual[:, :-1]
                     fit = fit_ellipse_direct(pixels[:, :-1])
@@ -240,6 +249,11 @@ class View:
         turn, shift = self.motion
         inside = np.einsum("nmi,nij->jnm", points_mm - shift[:, None, :], turn)
         return inside[0], inside[1], inside[2]
+
+    def in_world(self, points: Xyz) -> Floats:
+        """Transform points (n, k) of each eye's frame to the world: (n, k, 3) mm."""
+        turn, shift = self.motion
+        return np.asarray(np.einsum("nij,jnk->nki", turn, np.stack(points)) + shift[:, None, :])
 
     def project(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
         """Project points of the eye frame to pixels (n, k, 2); NaN where the status is not OK."""

@@ -16,6 +16,7 @@ from ..eye.legs import LensImage, lens_images
 from ..eye.model import EyeModel
 from ..eye.pose import Poses
 from ..optics.ellipse import fit_ellipse_direct
+from ..rig.imaging import Opening
 from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import (
     EYES,
@@ -28,6 +29,7 @@ from ..scene.observation import (
     PupilFeatures,
 )
 from .features import Features, features
+from .occluders import Occluders
 
 ARC_POINTS = 6
 ARC_GAP_DEG = 120.0
@@ -45,6 +47,11 @@ class TraceableScene(Protocol):
     @property
     def eye_name(self) -> str:
         """Name of the eye file, for messages."""
+        ...
+
+    @property
+    def openings(self) -> tuple[Opening, ...]:
+        """Openings through which the cameras look."""
         ...
 
     def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
@@ -94,9 +101,12 @@ class AnalyticObserver:
 
     Args:
         boundary_points: number of traced points of each pupil boundary.
+        occluded: whether obstacles of the rig and openings of the lens hide features. Labels of pictures state where
+            these are even so.
     """
 
     boundary_points: int = 30
+    occluded: bool = True
 
     def observe(self, frames: Traceable, rig: RigLike | None = None) -> Observations:
         """Observe every (frame, eye); `rig` replaces that of the frames."""
@@ -140,6 +150,7 @@ class AnalyticObserver:
             lit=scene.rig.lit(index.eye),
             boundary_points=self.boundary_points,
             purkinje=(1, *sorted(set(purkinje) - {1})),
+            occluders=Occluders.of(scene.rig, scene.openings) if self.occluded else None,
         )
         observed = Observations(
             index=index,
@@ -151,7 +162,9 @@ class AnalyticObserver:
         return observed, seen
 
 
-def trace(frames: Traceable | FrameSource, rig: RigLike | None = None, *, boundary_points: int = 30) -> Observations:
+def trace(
+    frames: Traceable | FrameSource, rig: RigLike | None = None, *, boundary_points: int = 30, occluded: bool = True
+) -> Observations:
     """Compute the apparent pupils and glints of frames, or of all frames of a scene, by ray optics.
 
     >>> er.trace(er.load_scene("headset")).pupil.centre_px.round(1)[0].tolist()
@@ -161,6 +174,7 @@ def trace(frames: Traceable | FrameSource, rig: RigLike | None = None, *, bounda
         frames: frames, or a scene for all of its frames.
         rig: replaces the rig of the frames.
         boundary_points: number of traced points of each pupil boundary.
+        occluded: whether obstacles of the rig and openings of the lens hide features.
 
     Raises:
         InputError: no pose of an eye fixates a target of the scene; the message names it and the reason.
@@ -169,7 +183,7 @@ def trace(frames: Traceable | FrameSource, rig: RigLike | None = None, *, bounda
     posed = frames.frames() if isinstance(frames, FrameSource) else frames
     if not isinstance(posed, Traceable):
         raise TypeError(f"give frames or a scene, not {type(frames).__name__}")
-    return AnalyticObserver(boundary_points).observe(posed, rig)
+    return AnalyticObserver(boundary_points, occluded).observe(posed, rig)
 
 
 def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:

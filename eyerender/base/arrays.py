@@ -123,10 +123,18 @@ class ArrayValue:
         return hash(tuple(_key(getattr(self, f.name)) for f in dataclasses.fields(self)))  # type: ignore[arg-type]
 
 
+SPECTACLE_FRAME, OBSTACLE = "spectacle frame", "obstacle"
+"""Parts that hide the eye besides its own lids and hairs, as reasons of hidden glints name them."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Body(ArrayValue):
-    """A matte body of triangles: vertices (n, 3) mm, unit normals (n, 3), faces (m, 3), albedo."""
+    """A matte body of triangles: vertices (n, 3) mm, unit normals (n, 3), faces (m, 3), albedo, and what it is.
 
+    `part` is `SPECTACLE_FRAME` or `OBSTACLE`.
+    """
+
+    part: str
     vertices: Floats
     normals: Floats
     faces: Ints

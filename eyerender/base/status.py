@@ -33,6 +33,8 @@ class Status(IntEnum):
     BEHIND_SCLERA = 7
     BEHIND_CAMERA = 8
     AT_LENS_EDGE = 17
+    BEHIND_OBSTACLE = 18
+    BEHIND_OPENING = 19
     # Fixations.
     TARGET_TOO_NEAR = 9
     OUT_OF_REACH = 10
@@ -77,6 +79,8 @@ _REASONS = {
     Status.BEHIND_SCLERA: "behind the sclera",
     Status.BEHIND_CAMERA: "behind the camera",
     Status.AT_LENS_EDGE: "at the edge of a lens",
+    Status.BEHIND_OBSTACLE: "occluded by obstacle",
+    Status.BEHIND_OPENING: "occluded by frame",
     Status.TARGET_TOO_NEAR: "the target lies inside the eye",
     Status.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     Status.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",

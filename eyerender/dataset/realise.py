@@ -179,7 +179,7 @@ def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, O
     scene = sample.build()
     check_windows(scene)
     posed = scene.frames()
-    found = trace(posed, boundary_points=plan.spec.labels.boundary_points)
+    found = trace(posed, boundary_points=plan.spec.labels.boundary_points, occluded=False)
     count = scene.frame_count
     if frames is not None and count != frames:
         raise InputError(f"has {count} frames, sample 0 has {frames}")

@@ -7,8 +7,9 @@ Every person is calibrated at nine of the directions. The information about the 
 with the blocks A (frame), B and C (person) of each frame's information and its prior, is added to the information of
 every other single frame. The bound is that of the line of sight. Points of the outline and glints count if a ray
 reaches the camera, they lie on the sensor, and the lids leave the ray free: it passes between their margins, which are
-as thick as those of the rendered lids. For a glint this holds for the light's way from the LED too. Lashes and frames
-are ignored.
+as thick as those of the rendered lids. For a glint this holds for the light's way from the LED too. Obstacles of the
+rig and openings of the lens hide features as they do for the analytic observer. Lashes and frames of spectacles are
+ignored.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from ..analytic.features import View
-from ..analytic.rays import glint_exits
-from ..base.arrays import ArrayValue, Bools, Floats, Indices, Ints
+from ..analytic.occluders import Occluders
+from ..analytic.rays import glint_exits, pupil_exits
+from ..base.arrays import ArrayValue, Bools, Floats, Indices, Ints, Statuses
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import structure_of, take_eyes
@@ -55,8 +57,8 @@ _MARGIN_COLUMNS = 44
 _VAGUE, _LOST_DEG = 1e3, 60.0
 _ACROSS = (0.2, 0.8, 1.0)  # places across the margin, whose rounded edges are 0 and 1
 _EXACT_DEG = 1e-3  # noise of a fixation that adds nothing to the bound
-LOST = ("ray", "sensor", "lid")
-"""Reasons for a missing glint: no ray (off the cornea), off the sensor, behind a lid."""
+LOST = ("ray", "sensor", "lid", "obstacle", "opening")
+"""Reasons for a missing glint: no ray (off the cornea), off the sensor, behind a lid, an obstacle, an opening."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +98,12 @@ class RigPopulation:
         azimuth = np.linspace(-self.azimuth_deg, self.azimuth_deg, GRID)
         return np.array([[a, e] for e in elevation for a in azimuth])
 
+    @property
+    def occluders(self) -> Occluders | None:
+        """Obstacles of the rig and openings of the lens; None if there are none."""
+        scene = Scene.of(SceneSpec.from_mapping(self.scene))
+        return Occluders.of(scene.rig, scene.openings)
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Figures(ArrayValue):
@@ -109,7 +117,7 @@ class Figures(ArrayValue):
         noise_deg: (p, 81) the same for an exactly known person: the part that differs between frames.
         outline: (p, 81) visible share of the outline, in the camera that sees most.
         glints: (p, 81) number of lights whose glint is visible in any camera.
-        lost: (p, 81, 3) glints (of any camera) that are missing for the reasons `LOST`.
+        lost: (p, 81, 5) glints (of any camera) that are missing for the reasons `LOST`.
         refused: numbers of people whose eye is physically impossible.
     """
 
@@ -208,6 +216,7 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
     """
     rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
     unknowns, people = Unknowns.from_mapping(survey.unknowns), people_of(survey, 0, count)[0]
+    occluders = survey.occluders
     if not people:
         raise InputError("no eye of this population is physically possible", path="population")
     parts: list[list[SiteInformation]] = [[] for _ in noises]
@@ -217,7 +226,7 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
         openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
         numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
         seen = [
-            seen_features(replace(instants, camera=number), theta, camera, openings)[0]
+            seen_features(replace(instants, camera=number), theta, camera, (openings, occluders))[0]
             for number, camera in zip(numbers, rig.cameras, strict=True)
         ]
         for part, noise in zip(parts, noises, strict=True):
@@ -228,22 +237,57 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
 
 
 def seen_features(
-    views: Views, theta: Floats, camera: PinholeCamera, openings: Floats | None, free: Bools | None = None
+    views: Views,
+    theta: Floats,
+    camera: PinholeCamera,
+    hidden_by: tuple[Floats | None, Occluders | None],
+    free: Bools | None = None,
 ) -> tuple[FeatureSlopes, Ints]:
-    """Trace the features of the views of one camera, and remove those that the lids hide, as `visible` does."""
-    lit = None if openings is None else mirror_points(views, theta)
-    return visible(slopes_of(views, theta, POINTS, free), camera, openings, lit, views.lights_mm)
+    """Trace the features of the views of one camera, and remove those that are hidden.
+
+    `hidden_by` are lines along the lids' margins, as for `visible`, and what else hides features.
+
+    Returns:
+        The features that are left, and the numbers (n, 5) of glints lost by reason (`LOST`).
+    """
+    openings, occluders = hidden_by
+    slopes = slopes_of(views, theta, POINTS, free)
+    if openings is None and occluders is None:
+        left, why = visible(slopes, camera, None)
+        return left, np.pad(why, [(0, 0), (0, len(LOST) - why.shape[1])])
+    outline, mirror = surface_points(views, theta)
+    left, why = visible(slopes, camera, openings, mirror, views.lights_mm)
+    on_outline, of_glints = (np.zeros(points.shape[:2], np.int8) for points in (outline, mirror))
+    if occluders is not None:
+        occluders.mark(on_outline, slopes.images.outline_px.copy(), outline, camera, None)
+        occluders.mark(of_glints, slopes.images.glints_px.copy(), mirror, camera, views.lights_mm)
+    return _unobstructed(left, why, on_outline, of_glints)
 
 
-def mirror_points(views: Views, theta: Floats) -> Floats:
-    """Compute where the cornea mirrors each light to the camera (n, m, 3) mm, in the world; NaN where it does not."""
+def surface_points(views: Views, theta: Floats) -> tuple[Floats, Floats]:
+    """Compute where outline (n, k, 3) and glints (n, m, 3) are seen on the cornea, in the world; NaN without a ray."""
     eye = take_eyes(views.eyes, views.person)
     camera = views.rig.cameras[int(views.camera[0])]
     view = View.of(eye, Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), views.position_mm, camera)
-    exits, _, status = glint_exits(eye, 1, view.into_eye(views.lights_mm), view.camera_mm)
-    turn, shift = view.motion
-    points = np.einsum("nij,jnm->nmi", turn, np.stack(exits)) + shift[:, None]
-    return np.asarray(np.where((status == Status.OK)[..., None], points, np.nan))
+    outline, _, seen = pupil_exits(eye, POINTS, view.camera_mm)
+    glints, _, mirrored = glint_exits(eye, 1, view.into_eye(views.lights_mm), view.camera_mm)
+    points = [
+        np.where((status == Status.OK)[..., None], view.in_world(exits), np.nan)
+        for exits, status in ((outline, seen), (glints, mirrored))
+    ]
+    return points[0][:, :-1], points[1]
+
+
+def _unobstructed(slopes: FeatureSlopes, why: Ints, outline: Statuses, glints: Statuses) -> tuple[FeatureSlopes, Ints]:
+    """Remove features (n, k) and (n, m) that obstacles and openings hide, and count the glints that this takes away."""
+    lost = [
+        np.count_nonzero(slopes.glint_ok & (glints == status), axis=1)
+        for status in (Status.BEHIND_OBSTACLE, Status.BEHIND_OPENING)
+    ]
+    left = replace(
+        slopes, outline_ok=slopes.outline_ok & (outline == Status.OK), glint_ok=slopes.glint_ok & (glints == Status.OK)
+    )
+    return left, np.column_stack([why, *lost])
 
 
 def _nobody(refused: list[int]) -> Figures:
@@ -266,11 +310,11 @@ def _of_group(survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, peop
     i, m = len(case.theta), len(rig.lights)
     matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
     glints, lost = np.zeros((i, m), dtype=bool), np.zeros((i, len(LOST)), dtype=np.int64)
-    openings = _openings(survey, people) if survey.lids else None
+    openings, occluders = _openings(survey, people) if survey.lids else None, survey.occluders
     free = Unknowns.from_mapping(survey.unknowns).free()
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        slopes, why = seen_features(views, case.theta, camera, openings, free)
+        slopes, why = seen_features(views, case.theta, camera, (openings, occluders), free)
         matrices += information_of_views(slopes, noise, views.camera)
         outline = np.maximum(outline, slopes.outline_ok.mean(axis=1))
         glints |= slopes.glint_ok
@@ -353,7 +397,7 @@ def visible(
     mirror_mm: Floats | None = None,
     lights_mm: Floats | None = None,
 ) -> tuple[FeatureSlopes, Ints]:
-    """Return the features that the lids leave visible, and the numbers (n, 3) of glints lost by reason (`LOST`).
+    """Return the features that the lids leave visible, and the numbers (n, 3) of lost glints by the first reasons.
 
     Args:
         slopes: the features of n views.

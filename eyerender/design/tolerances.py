@@ -224,14 +224,14 @@ def _of_group(
     survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, axes: Sequence[_Axis], group: Any
 ) -> tuple[Floats, Ints, Floats]:
     """Compute errors (p, 81, e, 2) deg, numbers of glints (p, 81) and shares of the outline (p, 81) of some people."""
-    case, openings = group
+    (case, openings), occluders = group, survey.occluders
     i, free = len(case.theta), Unknowns.from_mapping(survey.unknowns).free()
     size = len(free)
     matrices, pulls = np.zeros((i, size, size)), np.zeros((len(axes), i, size))
     glints, outline = np.zeros((i, len(rig.lights)), dtype=bool), np.zeros(i)
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        slopes, _ = seen_features(views, case.theta, camera, openings, free)
+        slopes, _ = seen_features(views, case.theta, camera, (openings, occluders), free)
         matrices += information_of_views(slopes, noise, views.camera)
         outline, glints = np.maximum(outline, slopes.outline_ok.mean(axis=1)), glints | slopes.glint_ok
         rows = whitened_rows(slopes, noise, views.camera)

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Body, Floats, frozen, remembered
+from ..base.arrays import SPECTACLE_FRAME, Body, Floats, frozen, remembered
 from ..base.spec import Side, Spec
 from ..optics.surfaces import components
 from .worn import FrameShape, WornLens
@@ -71,6 +71,7 @@ def frame_body(lens: WornLens) -> Body | None:
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in tubes)])
     vertices, normals, faces = zip(*tubes, strict=True)
     return Body(
+        part=SPECTACLE_FRAME,
         vertices=frozen(np.concatenate(vertices)),
         normals=frozen(np.concatenate(normals)),
         faces=frozen(np.concatenate([f + start for f, start in zip(faces, starts[:-1], strict=True)]), np.int64),

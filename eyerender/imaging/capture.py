@@ -239,6 +239,7 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         seed=int(seeds.generate_state(1, np.uint64)[0]),
         apex_mm=index.eye_position_mm[row] + index.head_mm[row],
         focus_dpt=focus_dpt(frames, row),
+        obstacles=scene.rig.obstacles,
     )
 
 
@@ -296,6 +297,8 @@ def check_windows(scene: RenderableScene) -> None:
     """
     if scene.spec.image.surfaces == "mesh":
         scene.refuse_spectacles("meshes of the eye are rendered")
+    if scene.rig.obstacles and scene.region is not None and scene.region.head is not None:
+        raise InputError("are not drawn around head meshes so far", path="rig.obstacles")
     spp = scene.spec.image.spp
     for i in range(len(scene.rig.cameras)):
         width, height = scene.window_size_px(i)

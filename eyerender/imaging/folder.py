@@ -53,7 +53,7 @@ def render_folder(
     refuse_non_empty(path, overwrite)  # before the work, not after it
     check_windows(scene)
     frames = scene.frames()
-    truth = trace(frames)
+    truth = trace(frames, occluded=False)
     records = list(truth.records())
     lines: list[dict[str, Any]] = []
     saturated = 0

@@ -89,7 +89,7 @@ def render(
     if picture or spp is not None:
         posed = posed.of_scene(posed.scene.with_(spp=spp, **picture))
     posed = posed.seen_by(rig)
-    truth = trace(posed)
+    truth = trace(posed, occluded=False)
     out = []
     for image in render_windows(posed, renderer=_renderer(backend, threads), progress=progress):
         parts = {field.name: getattr(image, field.name) for field in fields(image)}

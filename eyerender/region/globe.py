@@ -35,7 +35,7 @@ class Globe(ArrayValue):
         M: (3, 3) rotation of the motion p = M x + t into the unrotated frame.
         t: (3,) translation of that motion.
         mirrored: whether it is a left eye, whose region's frame has y reversed.
-        frames: what holds the lenses worn before it, in the unrotated frame, also for a left eye.
+        frames: what holds the lenses worn before it, and obstacles, in the unrotated frame, also for a left eye.
     """
 
     cornea: Surface | None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..base.arrays import ArrayValue, Body, Bools, Floats, Ints, frozen, sealed
+from ..base.arrays import OBSTACLE, SPECTACLE_FRAME, ArrayValue, Body, Bools, Floats, Ints, frozen, sealed
 from .anatomy import Region
 from .brow import PLACES as BROW_PLACES
 from .brow import brow
@@ -30,19 +30,22 @@ if TYPE_CHECKING:
     import trimesh
 
 PARTS = ("skin", "lashes", "brow", "tears")
-SPECTACLES = "spectacle frame"  # the part before the tears, if frames of spectacles are worn
 LID_MARKS = 17  # landmarks of a lid in labels
 HAIRS = 2  # the first of a mesh's strands, which are hairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionLayout(ArrayValue):
-    """Constant parts of a region's mesh: `faces` (m, 3), `uv` (n, 2), and the end of each part's vertices and faces."""
+    """Constant parts of a region's mesh: `faces` (m, 3), `uv` (n, 2), and the end of each part's vertices and faces.
+
+    `parts` are their names. Before the tears there may be frames of spectacles and obstacles.
+    """
 
     faces: Ints
     uv: Floats
     vertex_ends: Ints
     face_ends: Ints
+    parts: tuple[str, ...] = PARTS
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -73,8 +76,15 @@ class RegionMesh(ArrayValue):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Names of the parts of a procedural region."""
-        return PARTS if len(self.layout.face_ends) == len(PARTS) else (*PARTS[:-1], SPECTACLES, PARTS[-1])
+        """Names of the parts."""
+        return self.layout.parts
+
+    def faces_of(self, name: str) -> tuple[int, int] | None:
+        """Return the numbers of a part's first triangle and of the first one behind; None if there is no such part."""
+        if name not in self.parts:
+            return None
+        i = self.parts.index(name)
+        return int(self.layout.face_ends[i - 1]) if i else 0, int(self.layout.face_ends[i])
 
     def part(self, name: str) -> trimesh.Trimesh:
         """Return one part as a trimesh: skin, lashes, tears or brow."""
@@ -126,11 +136,14 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
         strands=tuple(strands),
         radii=(lash.radii, hair.radii),
     )
-    return _framed(mesh, globe.frames) if globe.frames else mesh
+    for name in (SPECTACLE_FRAME, OBSTACLE):
+        if some := [body for body in globe.frames if body.part == name]:
+            mesh = _with_bodies(mesh, name, some)
+    return mesh
 
 
-def _framed(mesh: RegionMesh, frames: Sequence[Body]) -> RegionMesh:
-    """Insert frames of spectacles as a part before the menisci."""
+def _with_bodies(mesh: RegionMesh, name: str, frames: Sequence[Body]) -> RegionMesh:
+    """Insert frames of spectacles, or obstacles, as a part before the menisci."""
     layout = mesh.layout
     v, f = (int(ends[-2]) for ends in (layout.vertex_ends, layout.face_ends))
     starts = v + np.cumsum([0, *(len(body.vertices) for body in frames)])
@@ -150,6 +163,7 @@ def _framed(mesh: RegionMesh, frames: Sequence[Body]) -> RegionMesh:
             frozen(joined(layout.uv, uv)),
             frozen([*layout.vertex_ends[:-1], v + added, layout.vertex_ends[-1] + added], np.int64),
             frozen([*layout.face_ends[:-1], f + len(own), layout.face_ends[-1] + len(own)], np.int64),
+            (*layout.parts[:-1], name, layout.parts[-1]),
         ),
     )
 

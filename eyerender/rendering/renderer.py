@@ -19,7 +19,7 @@ from .output.labels import PartLabels, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
 from .records.job import RenderJob
 from .records.recording import uncollected
-from .scene.background import Background, Obstacle
+from .scene.background import Background
 from .scene.blur import Blur
 from .scene.region import RegionScene
 
@@ -35,14 +35,13 @@ class Renderer:
     Args:
         backend: the backend.
         spp: samples per pixel.
-        obstacles: bodies in the scene's frame that hide and shade the eye.
     """
 
-    def __init__(self, backend: Backend, *, spp: int = 16, obstacles: Sequence[Obstacle] = ()) -> None:
+    def __init__(self, backend: Backend, *, spp: int = 16) -> None:
         self.backend = backend
         self.spp = spp
         self._beside = ThreadPoolExecutor(1, "develop")
-        self._builder = FrameBuilder(self._beside, obstacles)
+        self._builder = FrameBuilder(self._beside)
 
     def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
         """Render one window.

@@ -1,4 +1,4 @@
-"""The mount of a rig: a rigid motion of all its cameras and lights, as of a tilted headset or a mounting tolerance."""
+"""The mount of a rig: a rigid motion of all its cameras, lights and obstacles: a tilted headset, a tolerance."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Floats, frozen
+from ..base.arrays import Body, Floats, frozen
 from ..base.spec import Spec, Vec3
 from ..optics.transforms import rotated
 from .camera import PinholeCamera
@@ -49,3 +49,9 @@ class Mount(Spec):
             position_mm=frozen(rotated(rotation, lamp.position_mm) + offset),
             axis=frozen(rotated(rotation, lamp.axis)),
         )
+
+    def body(self, body: Body) -> Body:
+        """Move an obstacle."""
+        rotation, offset = self._motion()
+        moved = frozen(body.vertices @ rotation.T + offset)
+        return replace(body, vertices=moved, normals=frozen(body.normals @ rotation.T))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Protocol, Self
@@ -10,17 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from ..base.arrays import ArrayValue, Bools, Ints
+from ..base.arrays import ArrayValue, Body, Bools, Ints
 from ..base.errors import InputError
 from ..base.spec import KeyProblem, Side, Spec
 from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import Mount
+from .obstacles import Obstacle
 from .screen import Screen, ScreenPlane
 from .unit import UnitCalibration
 
 # Every camera has its own frame for every target and head position.
 MAX_CAMERAS = 100
+MAX_OBSTACLES = 32
 
 
 class Rig(Spec):
@@ -43,7 +46,12 @@ class Rig(Spec):
     )
     screen: Screen | None = Field(default=None, description="the screen that holds the targets")
     mount: Mount | None = Field(
-        default=None, description="moves all cameras and lights together, not the screen: a tilted headset, a tolerance"
+        default=None,
+        description="moves cameras, lights and obstacles together, not the screen: a tilted headset, a tolerance",
+    )
+    obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=MAX_OBSTACLES)] = Field(
+        default=(),
+        description="bodies that block light from LEDs to eyes and from eyes to cameras: a barrel, a bezel, a seal",
     )
 
     @model_validator(mode="after")
@@ -56,6 +64,8 @@ class Rig(Spec):
         for i, light in enumerate(self.lights):
             if light.ring is not None and light.ring.camera >= len(self.cameras):
                 raise ValueError(f"lights.{i}.ring.camera: there is no camera {light.ring.camera}")
+        if self.obstacles and any(camera.mirror is not None for camera in self.cameras):
+            raise ValueError("obstacles: cannot be given with a camera that looks past a mirror")
         if self.light_count > MAX_LIGHTS:
             raise ValueError(f"lights: are {self.light_count} with those of the rings; at most {MAX_LIGHTS}")
         return self
@@ -139,7 +149,7 @@ class Rig(Spec):
         """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
-        geometry, leds = self.model_copy(update={"mount": None}).build(), []
+        geometry, leds = self.model_copy(update={"mount": None, "obstacles": ()}).build(), []
         for led in self.lights:
             if led.ring is None:
                 leds.append(led.to_mapping())
@@ -150,7 +160,7 @@ class Rig(Spec):
         return leds
 
     def _with_leds(self, leds: list[dict[str, Any]], **fields: Any) -> Self:
-        kept = {"cameras": self.cameras, "lights": leds, "screen": self.screen, "mount": self.mount}
+        kept = {name: getattr(self, name) for name in ("cameras", "screen", "mount", "obstacles")} | {"lights": leds}
         return type(self).from_mapping({**kept, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
@@ -168,8 +178,25 @@ class Rig(Spec):
         changed = any(new is not old for new, old in zip(cameras, self.cameras, strict=True))
         return self.model_copy(update={"cameras": cameras}) if changed else self
 
+    def located(self, base: Path | None = None) -> Self:
+        """Return the rig with the files of its obstacles as absolute paths; they are relative to `base`."""
+        if all(obstacle.file is None for obstacle in self.obstacles):
+            return self
+        return self.model_copy(update={"obstacles": tuple(obstacle.located(base) for obstacle in self.obstacles)})
+
+    def _bodies(self) -> Iterator[Body]:
+        for k, obstacle in enumerate(self.obstacles):
+            try:
+                yield obstacle.build(self.mount)
+            except InputError as error:
+                raise error.placed(under=f"rig.obstacles.{k}") from None
+
     def build(self) -> RigGeometry:
-        """Build the numeric rig."""
+        """Build the numeric rig.
+
+        Raises:
+            InputError: the file of an obstacle cannot be read.
+        """
         if self.calibration is not None:
             return self.resolved().build()
         cameras = tuple(camera.build() for camera in self.cameras)
@@ -179,7 +206,7 @@ class Rig(Spec):
         if self.mount is not None:
             cameras = tuple(map(self.mount.camera, cameras))
             lights = tuple(map(self.mount.lamp, lights))
-        return RigGeometry(cameras, lights, self.screen.build() if self.screen else None)
+        return RigGeometry(cameras, lights, self.screen.build() if self.screen else None, tuple(self._bodies()))
 
 
 class RigLike(Protocol):
@@ -195,11 +222,12 @@ class RigLike(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry(ArrayValue):
-    """Cameras, lights and the screen, if there is one."""
+    """Cameras, lights, the screen, if there is one, and obstacles, which `to_mapping` leaves out."""
 
     cameras: tuple[PinholeCamera, ...]
     lights: tuple[Lamp, ...]
     screen: ScreenPlane | None
+    obstacles: tuple[Body, ...] = ()
 
     def build(self) -> RigGeometry:
         """Return this rig, which is already numeric."""

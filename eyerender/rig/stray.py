@@ -13,6 +13,7 @@ Light scatters over the whole sensor. If only a window is rendered, a coarse ima
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, ndimage, special
 
-from ..base.arrays import Bools, Reals, Singles, frozen
+from ..base.arrays import Bools, Floats, Ints, Reals, Singles, frozen
 from .camera import PinholeCamera, Window
 from .imaging import Lens, Opening, Star
 from .sensor import Sensor
@@ -147,13 +148,29 @@ def transmission(opening: Opening, camera: PinholeCamera, window: Window) -> Sin
 
 @lru_cache(maxsize=8)  # it is the same in every frame of a camera
 def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Window) -> Singles:
-    half = resolution_px[0] / 2
     x0, y0, width, height = window
-    x = (np.arange(x0, x0 + width) + 0.5 - resolution_px[0] / 2) / half - opening.centre[0]
-    y = (np.arange(y0, y0 + height) + 0.5 - resolution_px[1] / 2) / half - opening.centre[1]
+    x, y = np.arange(x0, x0 + width)[None, :], np.arange(y0, y0 + height)[:, None]
+    return frozen(_transmission_at(opening, resolution_px, x, y), np.float32)
+
+
+def hidden_at(openings: Sequence[Opening], camera: PinholeCamera, points_px: Floats) -> Bools:
+    """Return which points (..., 2) of a camera's stored picture are half covered by openings of its lens, or more."""
+    x, y = points_px[..., 0], points_px[..., 1]
+    x = camera.resolution_px[0] - 1 - x if camera.flip else x
+    through = np.ones(x.shape)
+    for opening in openings:
+        through = through * _transmission_at(opening, tuple(camera.resolution_px), x, y)
+    return np.asarray(through < 0.5)
+
+
+def _transmission_at(opening: Opening, resolution_px: tuple[int, int], x: Reals | Ints, y: Reals | Ints) -> Floats:
+    """Compute the share of light that an opening transmits to points of the sensor, px; arrays of one shape."""
+    half = resolution_px[0] / 2
+    x = (x + 0.5 - resolution_px[0] / 2) / half - opening.centre[0]
+    y = (y + 0.5 - resolution_px[1] / 2) / half - opening.centre[1]
     cos, sin = np.cos(np.radians(opening.turn_deg)), np.sin(np.radians(opening.turn_deg))
-    u = np.abs(x[None, :] * cos + y[:, None] * sin) / opening.half_size[0]
-    v = np.abs(y[:, None] * cos - x[None, :] * sin) / opening.half_size[1]
+    u = np.abs(x * cos + y * sin) / opening.half_size[0]
+    v = np.abs(y * cos - x * sin) / opening.half_size[1]
     # f is 1 on the edge; (1 - f) / |grad f| is the distance from it to first order. The centre, where that is 0 / 0, is
     # given a direction.
     u = np.where((u == 0) & (v == 0), 1e-9, u)
@@ -164,8 +181,8 @@ def _transmission(opening: Opening, resolution_px: tuple[int, int], window: Wind
     slope = np.hypot((u / size) ** (p - 1) / opening.half_size[0], (v / size) ** (p - 1) / opening.half_size[1])
     inside_px = half * (1 - most * size) / slope
     if opening.edge_px == 0:
-        return frozen(inside_px >= 0, np.float32)
-    return frozen(special.ndtr(inside_px / opening.edge_px), np.float32)
+        return np.asarray(inside_px >= 0, dtype=float)
+    return np.asarray(special.ndtr(inside_px / opening.edge_px))
 
 
 def ghost(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:

@@ -39,7 +39,7 @@ from ..region.anatomy import Region
 from ..region.face import face_depth
 from ..rig.camera import PinholeCamera, Window
 from ..rig.exposure import automatic_exposure, iris_radiance
-from ..rig.imaging import Ambient
+from ..rig.imaging import Ambient, Opening
 from ..rig.light import Lamp
 from ..rig.plausibility import (
     fold_warnings,
@@ -203,7 +203,7 @@ class Scene:
             device, spec = spec.rig.calibration, spec.model_copy(update={"rig": authored})
             if device is not None:
                 spec = SceneSpec.from_mapping(spec.to_mapping(), source=source)  # whose checks need all cameras
-        built = spec.rig.build() if rig is None else rig
+        built = spec.rig.located(base).build() if rig is None else rig
         if spec.sensor.exposure_ms is None:
             spec = spec.model_copy(update={"sensor": _exposed(spec, built)})
         eyes: EyeSpec | _DrawnEyes
@@ -493,11 +493,18 @@ class Scene:
             named.append(str((Path.cwd() if self.base is None else self.base) / self.spec.region.head.files[0]))
         if region is not None and region.head is not None:
             named += [*region.head.files, *([] if region.head.texture is None else [region.head.texture])]
+        named += [part.file for part in self.spec.rig.located(self.base).obstacles if part.file is not None]
         return tuple(Path(name) for name in named)
 
     def located(self) -> SceneSpec:
         """Return a spec that does not depend on its folder: absolute paths, and the manifest of a head included."""
-        return self.spec.model_copy(update={"ambient": self.ambient, "region": self.region})
+        placed = {"ambient": self.ambient, "region": self.region, "rig": self.spec.rig.located(self.base)}
+        return self.spec.model_copy(update=placed)
+
+    @property
+    def openings(self) -> tuple[Opening, ...]:
+        """Openings through which the cameras look."""
+        return self.spec.lens.openings
 
     def eye(self, side: Literal["right", "left"] | str, head_mm: tuple[float, ...] | None = None) -> EyeModel:
         """Build the numeric eye of one side at the scene's wavelength, with the scene's pupil size, margin and glasses.

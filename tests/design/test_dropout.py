@@ -52,7 +52,7 @@ def seen_by_rig(survey, one):
     case = people._case(survey, rig, [one])
     views, theta = replace(case.instants.take(CELLS), camera=np.zeros(9, np.int64)), case.theta[CELLS]
     slopes = slopes_of(views, theta, 4, np.zeros(COUNT, dtype=bool))
-    lit = people.mirror_points(views, theta)
+    lit = people.surface_points(views, theta)[1]
     openings = people._openings(survey, [one])[CELLS]
     left, _ = people.visible(slopes, rig.cameras[0], openings, lit, views.lights_mm)
     return slopes.glint_ok, left.glint_ok

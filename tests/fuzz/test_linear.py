@@ -11,7 +11,7 @@ import pytest
 from eyerender.base.errors import EyerenderError
 from eyerender.base.storage.files import read_json
 from eyerender.gaze.records import load_observations
-from eyerender.region.meshfile import read_objects
+from eyerender.optics.meshfile import read_objects
 from eyerender.rig.opencv import read_opencv
 from tests.support.growth import growth
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from eyerender.base.arrays import OBSTACLE, Body
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
@@ -103,6 +104,14 @@ def job_of(
         apex_mm=np.zeros(3), seed=1,
     )  # fmt: skip
     return replace(job, **changes)
+
+
+def card(corners_mm: np.ndarray) -> tuple[Body, ...]:
+    """An obstacle with four corners (4, 3) in a plane."""
+    normal = np.cross(corners_mm[1] - corners_mm[0], corners_mm[2] - corners_mm[0])
+    normals = np.tile(normal / np.linalg.norm(normal), (4, 1))
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return (Body(part=OBSTACLE, vertices=corners_mm, normals=normals, faces=faces, albedo=0.3),)
 
 
 def digest(window: RenderedWindow) -> str:

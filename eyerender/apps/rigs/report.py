@@ -455,6 +455,8 @@ def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) ->
         "ray": "no ray: the mirror point is off the cornea",
         "sensor": "off the sensor",
         "lid": "behind a lid, for the camera or the LED",
+        "obstacle": "behind an obstacle, for the camera or the LED",
+        "opening": "outside an opening of the lens",
     }
     missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
     tables = [

@@ -194,7 +194,7 @@ class SceneTruth:
             if isinstance(made_by, dict) and made_by.get("eyerender") != versions()["eyerender"]:
                 raise NoTruth("another version of the package made it")
             problems.add(f"{DATASET}: its digest does not match its scene, its eye and its files")
-        return cls(frames, trace(frames))
+        return cls(frames, trace(frames, occluded=False))
 
     def whose(self, line: dict[str, Any]) -> dict[str, Any]:
         """Return the file names that a line must have; raise one of `WRONG`."""

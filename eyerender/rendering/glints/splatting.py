@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...base.arrays import Bools, Cache, Floats, Singles, frozen
-from ...region.mesh import SPECTACLES
+from ...base.arrays import OBSTACLE, SPECTACLE_FRAME, Bools, Cache, Floats, Singles, frozen
 from ...rig import defocus, psf
 from ...rig.camera import Window
 from ...rig.light import Lamp
 from ..hits.meshes import SurfaceMesh
 from ..records.job import RenderJob, sun_lamps
-from ..scene.background import Background
+from ..scene.background import Background, blockers
 from ..scene.blur import Blur
-from ..scene.region import RegionScene, blockers
+from ..scene.region import RegionScene
 from .cutdiscs import POINT, quadrature
 from .lensglints import defocused, lens_reflections
 from .purkinje import purkinje_images
@@ -24,7 +23,8 @@ from .tracing import Glint, GlintScene, GlintTable, Image, LampImages, LampSpots
 
 _KNOWN: Cache[list[Image]] = Cache(8)
 _FRAMED = "occluded by frame"
-_BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow", SPECTACLES: SPECTACLES}
+_BY = {"skin": "lid", "tears": "lid", "lashes": "lash", "brow": "brow"}
+_BY |= {SPECTACLE_FRAME: SPECTACLE_FRAME, OBSTACLE: OBSTACLE}
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ def _reason(job: RenderJob, place: Background | RegionScene, glint: Glint) -> st
     image = glint.image
     open_ = glint.clear if place.obstructed else np.ones(len(glint.clear), dtype=bool)
     names: list[str | None] = [None] * len(open_)
-    if isinstance(place, RegionScene) and not np.all(open_):
+    if not np.all(open_):
         anchor = job.anchor_mm
         node = np.broadcast_to(job.camera.nodal_point_mm, image.exit_mm.shape)
         to_lamp = blockers(place, image.source_mm - anchor, image.entry_mm - anchor)

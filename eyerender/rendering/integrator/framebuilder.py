@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ...base.arrays import Cache
-from ...base.errors import InputError
 from ...region.mesh import RegionMesh, region_mesh
 from ...rig.distortion import is_distorted
 from ...rig.imaging import Ambient
@@ -21,7 +19,7 @@ from ..materials.albedo import Textures
 from ..records.frame import DeviceFrame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, lens_kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
-from ..scene.background import Background, Obstacle
+from ..scene.background import Background
 from ..scene.head import HeadScene
 from ..scene.region import RegionScene
 from ..transport.diffusion import DiffusedLight
@@ -70,12 +68,11 @@ class FrameBuilder:
 
     Args:
         beside: executor of one thread, for host work.
-        obstacles: bodies in the scene's frame around eyes without a region.
     """
 
-    def __init__(self, beside: Executor, obstacles: Sequence[Obstacle] = ()) -> None:
+    def __init__(self, beside: Executor) -> None:
         self._beside = beside
-        self._background = Background(obstacles)
+        self._background = self._obstructed = Background()
         self._textures: Cache[Textures] = Cache(_TEXTURES)
         self._regions: dict[Any, RegionScene] = {}  # least recently used first
         self._filled = 0
@@ -204,10 +201,13 @@ class FrameBuilder:
     def _pose_surroundings(self, job: RenderJob, known: RegionMesh | None) -> Background | RegionScene:
         """Pose the surroundings of a job; the mesh of a region may already be computed."""
         if job.region is None:
-            self._background.show(job.look)
-            return self._background
-        if self._background.obstructed:
-            raise InputError("obstacles cannot be combined with an eye region")
+            bodies = job.bodies
+            if bodies and not self._obstructed.takes(bodies):
+                forget()
+                self._obstructed = Background(bodies)
+            background = self._obstructed if bodies else self._background
+            background.show(job.look, bodies)
+            return background
         surroundings = self._region(job, known)
         surroundings.show(job.region, job.globe, known)
         return surroundings

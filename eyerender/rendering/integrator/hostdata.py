@@ -142,7 +142,8 @@ class HostData:
             camera, anchor = self.job.viewer(), self.job.anchor_mm
             fine, wet = supersampled_pixels(self.posed, camera, anchor, window)
             plain = np.zeros_like(fine)
-            if self.posed is not None and not self.job.eye.worn:  # the edge of a lens may cross any pixel of skin
+            # The edge of a lens or an obstacle may cross any pixel of skin.
+            if self.posed is not None and not self.job.eye.worn and not self.job.obstacles:
                 tiles, size = skin_only_tiles(self.posed, camera, anchor, window)
                 plain = tiles.repeat(size, 0).repeat(size, 1)[: window[3], : window[2]] & ~fine
             self._marks[window] = (fine * FINE + wet * WET + plain * PLAIN).astype(np.uint8).ravel()

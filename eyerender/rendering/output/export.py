@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...base.arrays import Floats
+from ...base.arrays import OBSTACLE, Floats
 from ...base.errors import InputError
 from ...eye.meshes import Patch, eye_meshes
 from ...eye.model import EyeModel
 from ...region.anatomy import Region
-from ...region.head import HEAD_PARTS, load_head, placed
+from ...region.head import load_head, placed
 from ...region.mesh import region_mesh
 from ...rig.imaging import Ambient
 from ..records.job import RenderJob, sun_lamps
@@ -90,6 +90,9 @@ def export_scene(
     else:
         for patch, matte in _region(job, job.region):
             _patch(root, folder, patch, place, matte)
+    for k, body in enumerate(job.obstacles):
+        patch = Patch(f"obstacle_{k}", body.vertices, body.normals, body.faces)
+        _patch(root, folder, patch, np.eye(4), body.albedo)
     for k, lamp in enumerate((*job.lights, *sun_lamps(job.ambient, job.anchor_mm))):
         _lamp(root, k, lamp.position_mm, lamp.axis, float(lamp.radius_mm), float(lamp.intensity_mw_sr))
     ET.indent(root)
@@ -237,8 +240,8 @@ def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
             ),
             albedo.get(name, skin.albedo),
         )
-        for k, name in enumerate(HEAD_PARTS[: len(f) - 1])
-        if f[k + 1] > f[k] and (spec.head is not None or name != "tears")
+        for k, name in enumerate(mesh.parts)
+        if f[k + 1] > f[k] and name != OBSTACLE and (spec.head is not None or name != "tears")
     ]
 
 

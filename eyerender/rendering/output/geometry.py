@@ -15,12 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...base.arrays import ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
+from ...base.arrays import OBSTACLE, SPECTACLE_FRAME, ArrayValue, Bools, Bytes, Floats, Indices, Singles, frozen, sealed
 from ...optics.interface import dot
 from ...optics.surfaces import Surface, Xyz
 from ...optics.surfaces_quadric import Quadric
 from ...optics.transforms import rotated
-from ...region.mesh import SPECTACLES, sheet_codes
+from ...region.mesh import sheet_codes
 from ...rig.distortion import is_distorted
 from ...scene.parts import FRAME, IRIS, PUPIL, SCLERA
 from ..hits.eyeshape import EyeShape
@@ -35,7 +35,8 @@ from .labels import PartLabels, cover_of, part_of
 
 NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, RIMS, TEARS = 0, 5, 6, 7, 8, 9, 10, 11, 12
 """Instances in addition to the parts of a mask."""
-_PARTS = {"skin": SKIN, "head": SKIN, "lashes": LASHES, "brow": BROW, "tears": TEARS, SPECTACLES: RIMS}
+_PARTS = {"skin": SKIN, "head": SKIN, "lashes": LASHES, "brow": BROW, "tears": TEARS}
+_PARTS |= {SPECTACLE_FRAME: RIMS, OBSTACLE: FRAME}
 _STRIP = 4096  # rays whose numbers fit into a processor's cache
 _STEPS = 2  # of Newton's method, which rays at a grazing angle need
 _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
@@ -179,7 +180,7 @@ def _surface(job: RenderJob, hits: Hits) -> tuple[Singles | None, Singles | None
     shape = job.window[3], job.window[2]
     axes = job.camera.sensor_axes @ job.M  # eye's frame to that of the picture
     exact = [] if job.mesh_edge_mm is not None else _on_eye(job, hits, axes)
-    nothing = np.flatnonzero(hits.instance == NOTHING)
+    nothing = np.flatnonzero((hits.instance == NOTHING) | (hits.instance == FRAME))
     depth, normals = None, None
     if "depth" in job.geometry:
         reach = _rays(job, axes).to_planes(hits.point, hits.normal)

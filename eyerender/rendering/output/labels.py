@@ -20,6 +20,7 @@ from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
 from ..records.frame import DeviceFrame
 from ..records.recording import recorded, syntax
+from ..scene.background import PLANE_FACES
 from ..transport.directlight import direct_light, lamp_blocked
 
 _HIGHLIGHT = 0.5  # share of the scattered light
@@ -31,7 +32,7 @@ class PartLabels(ArrayValue):
     """Part at each pixel's centre, seen through the cornea; arrays (height, width).
 
     Attributes:
-        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view, 5
+        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view and obstacles, 5
             frame of spectacles.
         amodal: the same for the eye alone, without occluders.
     """
@@ -66,7 +67,9 @@ def _parts(frame: DeviceFrame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi
     o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
     eye = EyeShape(frame=frame).ray_intersect(o, d)
     amodal = part_of(eye)
-    if frame.region is not None and frame.region.spectacles is not None:
+    region = frame.region
+    named = frame.structure.obstacles if region is None else bool(region.spectacles or region.obstacles)
+    if named:
         hit = hit_before(frame, o, d, eye.distance, mi.Bool(True))
         part = dr.select(hit.is_valid(), cover_of(frame, hit), amodal)
     else:
@@ -76,10 +79,14 @@ def _parts(frame: DeviceFrame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi
 
 
 def cover_of(frame: DeviceFrame, hit: TriangleHit) -> mi.UInt8:
-    """Return the part at hits before the eye: spectacles or background."""
-    if frame.region is None or frame.region.spectacles is None:
-        return mi.UInt8(BACKGROUND)
-    return dr.select(frame.region.on_spectacles(frame.region.face(hit)), mi.UInt8(SPECTACLES), mi.UInt8(BACKGROUND))
+    """Return the part at hits before the eye: spectacles, obstacles (as a frame of the view) or background."""
+    nothing = mi.UInt8(BACKGROUND)
+    if frame.region is None:
+        obstacle = frame.structure.obstacles & (hit.prim_index >= PLANE_FACES)
+        return dr.select(obstacle, mi.UInt8(FRAME), nothing)
+    face = frame.region.face(hit)
+    part = dr.select(frame.region.on_spectacles(face), mi.UInt8(SPECTACLES), nothing)
+    return dr.select(frame.region.on_obstacles(face), mi.UInt8(FRAME), part)
 
 
 def part_of(eye: SurfaceInteraction) -> mi.UInt8:

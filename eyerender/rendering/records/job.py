@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import ArrayValue, Bools, Floats, frozen, remembered
+from ...base.arrays import ArrayValue, Body, Bools, Floats, frozen, remembered, sealed
 from ...base.errors import InputError
 from ...eye.entrance import entrance_pupil
 from ...eye.frames import frame_body
@@ -84,6 +84,7 @@ class RenderJob(ArrayValue):
         focus_dpt: vergence (D) of the point in focus, 1 / its distance in metres.
         mesh_edge_mm: edge length of meshes that replace the cornea's surfaces; None: closed forms.
         interreflection: whether surfaces illuminate each other.
+        obstacles: bodies in the world that hide and shade the eye; they send no light to other surfaces.
     """
 
     eye: EyeModel
@@ -108,6 +109,7 @@ class RenderJob(ArrayValue):
     highlights: bool = False
     geometry: tuple[str, ...] = ()
     flip: bool = False
+    obstacles: tuple[Body, ...] = ()
 
     @property
     def anchor_mm(self) -> Floats:
@@ -126,9 +128,16 @@ class RenderJob(ArrayValue):
         return past_lenses(self.camera, self.eye.worn, self.anchor_mm, thorough=thorough)
 
     @property
+    def bodies(self) -> tuple[Body, ...]:
+        """Obstacles in the scene's frame."""
+        anchor = self.anchor_mm if self.obstacles else 0.0
+        return tuple(replace(body, vertices=sealed(body.vertices - anchor)) for body in self.obstacles)
+
+    @property
     def globe(self) -> Globe:
-        """Posed globe in the scene's frame."""
-        return globe_of(self.eye, self.M, self.t - self.anchor_mm)
+        """Posed globe in the scene's frame, with what stands before it."""
+        globe = globe_of(self.eye, self.M, self.t - self.anchor_mm)
+        return replace(globe, frames=(*globe.frames, *self.bodies)) if self.obstacles else globe
 
     @property
     def film_index(self) -> float:

@@ -1,4 +1,4 @@
-"""Background of an eye without a region: a matte plane and other obstacles.
+"""Background of an eye without a region: a matte plane and obstacles.
 
 The background is fixed in the scene's frame (the world's axes, origin at the apex of the unrotated eye), so it need not
 be rebuilt for another pose or camera. The plane is matte skin behind the apex, and the globe protrudes through it. It
@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...base.arrays import ArrayValue, Bools, Floats, Ints, Singles
+from ...base.arrays import OBSTACLE, Body, Bools, Floats, Ints, Singles
 from ...optics.vectors import lengths
 from ...region.look import Look
 from ...region.mapcache import kept
@@ -24,17 +24,9 @@ from ..records.frame import aligned_copy
 from ..records.recording import recorded
 
 HALF_MM = 500.0
+PLANE_FACES = 2  # of the plane, before those of obstacles
 _TILE_MM = 60.0
 _FEWEST = 64  # rays
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Obstacle(ArrayValue):
-    """A matte body in the scene's frame: vertices (n, 3) mm, faces (m, 3), albedo."""
-
-    vertices_mm: Floats
-    faces: Any
-    albedo: float = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,21 +85,16 @@ class BackgroundGeometry:
 
 
 class Background:
-    """The Mitsuba scene of the background; `show` changes its look in place."""
+    """The Mitsuba scene of the background, with the faces of obstacles; `show` changes its look and places."""
 
     posed = None  # no region
+    parts = "head", OBSTACLE
 
-    def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
-        places, faces, albedos = [_corners(10.0)], [np.array([[0, 1, 2], [0, 2, 3]])], [np.full(4, -1.0)]
-        for body in obstacles:
-            faces.append(np.asarray(body.faces) + sum(len(p) for p in places))
-            places.append(np.asarray(body.vertices_mm, dtype=np.float64))
-            albedos.append(np.full(len(places[-1]), body.albedo))
-        self._vertices, self._albedos, triangles = (
-            np.concatenate(places),
-            np.concatenate(albedos),
-            np.concatenate(faces),
-        )
+    def __init__(self, obstacles: Sequence[Body] = ()) -> None:
+        self._vertices, self._albedos = np.zeros((0, 3)), np.zeros(0)
+        self._faces = triangles = _faces(obstacles)
+        self.face_ends = np.array([PLANE_FACES, len(triangles)])
+        self._place(10.0, obstacles)
         mesh = mi.Mesh("background", len(self._vertices), len(triangles))
         params = mi.traverse(mesh)
         params["vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
@@ -120,13 +107,26 @@ class Background:
         self.obstructed = len(obstacles) > 0
         self._shown: tuple[float, float, float] | None = None
 
-    def show(self, look: Look) -> None:
-        """Set distance, albedo and contrast of the plane from a look."""
+    def _place(self, distance_mm: float, obstacles: Sequence[Body]) -> bool:
+        """Set the vertices, and return whether any of them moved or changed."""
+        vertices = np.concatenate([_corners(distance_mm), *(body.vertices for body in obstacles)])
+        albedos = np.concatenate([np.full(4, -1.0), *(np.full(len(b.vertices), b.albedo) for b in obstacles)])
+        same = np.array_equal(vertices, self._vertices) and np.array_equal(albedos, self._albedos)
+        self._vertices, self._albedos = vertices, albedos
+        return not same
+
+    def takes(self, obstacles: Sequence[Body]) -> bool:
+        """Return whether obstacles have the faces of this background."""
+        count = 4 + sum(len(body.vertices) for body in obstacles)
+        return len(self._vertices) == count and np.array_equal(self._faces, _faces(obstacles))
+
+    def show(self, look: Look, obstacles: Sequence[Body] = ()) -> None:
+        """Set distance, albedo and contrast of the plane from a look, and place obstacles (scene's frame)."""
         wanted = (look.backdrop_distance_mm, look.backdrop_albedo, look.backdrop_contrast)
-        if wanted == self._shown:
+        moved = self._place(wanted[0], obstacles)
+        if wanted == self._shown and not moved:
             return
-        if self._shown is None or self._shown[0] != wanted[0]:
-            self._vertices[:4] = _corners(wanted[0])
+        if self._shown is None or moved:
             self._params["background.vertex_positions"] = mi.Float(self._vertices.astype(np.float32).ravel())
             self._params.update()
             self.geometry.place(self._vertices, self._albedos)
@@ -137,6 +137,13 @@ class Background:
     def clear(self, a: Floats, b: Floats) -> Bools:
         """Return whether the background leaves the lines between points (n, 3), scene's frame, free; ends excluded."""
         return clear_between(self.scene, a, b) if self.obstructed else _beside_plane(self._vertices[0, 0], a, b)
+
+
+def _faces(obstacles: Sequence[Body]) -> Ints:
+    """Return the triangles (m, 3) of the plane and of obstacles behind it in the list of vertices."""
+    starts = 4 + np.cumsum([0, *(len(body.vertices) for body in obstacles)])
+    own = [body.faces + start for body, start in zip(obstacles, starts[:-1], strict=True)]
+    return np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]), *own])
 
 
 def _beside_plane(x: float, a: Floats, b: Floats) -> Bools:
@@ -194,3 +201,28 @@ def _rays(table: mi.Float, count: int) -> mi.Ray3f:
 def _corners(distance_mm: float) -> Floats:
     h = HALF_MM
     return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])
+
+
+class Surroundings(Protocol):
+    """What may block light around an eye: triangles of parts in order."""
+
+    scene: mi.Scene
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts."""
+        ...
+
+    @property
+    def face_ends(self) -> Ints:
+        """End of each part's triangles."""
+        ...
+
+
+def blockers(place: Surroundings, a: Floats, b: Floats) -> list[str | None]:
+    """Return the first part between points (n, 3) a and b of the scene's frame; None if there is none."""
+    hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
+    valid, face = hit.is_valid(), mi.UInt32(hit.prim_index)
+    dr.eval(valid, face)
+    which = np.searchsorted(place.face_ends, face.numpy(), side="right")
+    return [place.parts[int(w)] if v else None for v, w in zip(valid.numpy(), which, strict=True)]

@@ -91,8 +91,9 @@ def _depths(job: RenderJob, posed: RegionMesh | None) -> Floats:
     camera = job.camera
     middle = float(camera.depth(np.asarray(job.eye.sclera.centre_mm) @ job.M.T + job.t))
     depths = [middle - _GLOBE_MM, middle]
-    if posed is not None:
-        points = posed.vertices + job.anchor_mm
+    if posed is not None or job.obstacles:
+        bodies = [body.vertices for body in job.obstacles]
+        points = posed.vertices + job.anchor_mm if posed is not None else np.concatenate(bodies)
         xy, front = camera.project(points)
         x0, y0, width, height = job.window
         with np.errstate(invalid="ignore"):

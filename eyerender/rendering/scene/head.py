@@ -12,7 +12,7 @@ from ...base.errors import InputError
 from ...optics.transforms import rotated
 from ...region.anatomy import Region
 from ...region.globe import Globe
-from ...region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
+from ...region.head import head_map, load_head, placed, texture_rows
 from ...region.headspec import Head
 from ...region.mesh import RegionMesh
 from .region import RegionScene
@@ -29,11 +29,6 @@ class HeadScene(RegionScene):
     """
 
     fixed = True
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Names of the parts."""
-        return HEAD_PARTS
 
     def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
         super().__init__(spec, globe, known)

@@ -15,17 +15,17 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import Bools, Floats, Singles
+from ...base.arrays import OBSTACLE, SPECTACLE_FRAME, Bools, Floats, Ints, Singles
 from ...region.anatomy import Region
 from ...region.contour import COLUMNS
 from ...region.globe import Globe
 from ...region.head import file_states
 from ...region.lids import FINE, ROWS
 from ...region.mapcache import kept
-from ...region.mesh import SPECTACLES, RegionLayout, RegionMesh, region_mesh, sheet_ends
+from ...region.mesh import HAIRS, RegionLayout, RegionMesh, region_mesh, sheet_ends
 from ...region.skin import SHEET_ROWS, sheet_v, skin_texels
 from ..records.frame import aligned_copy
-from .background import clear_between, rays_between
+from .background import clear_between
 from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
 
 _THIN_ROWS = 6.0  # rows of the sheet over which the conjunctiva reaches its full thickness
@@ -84,9 +84,7 @@ class RegionScene:
         inner = self._inner()
         thin = 0.0 if spec.skin.map == "off" else float(sheet_v(np.array(_THIN_ROWS / (ROWS - 1))))
         self.skin = SkinGeometry.of(look, posed.layout, mirror, thin, inner, self._water)
-        if SPECTACLES in self.parts:
-            first, last = (dr.opaque(mi.UInt32, int(end)) for end in posed.layout.face_ends[-3:-1])
-            self.skin.spectacles = first, last
+        self.skin.spectacles, self.skin.obstacles = map(self._range, (SPECTACLE_FRAME, OBSTACLE))
         self.relief = {} if inner is None else _mean_slopes(pixels)
         self.sheet_faces = int(posed.layout.face_ends[0])
         self._records = np.zeros((len(posed.layout.uv), 8), np.float32)
@@ -95,20 +93,32 @@ class RegionScene:
         self._shown: tuple[Region, Globe] | None = (spec, globe)
         self.subject = self.key(spec, globe)
 
+    def _range(self, name: str) -> tuple[mi.UInt32, mi.UInt32] | None:
+        """Return the triangles of a part on the device, from the first one to the first one behind."""
+        ends = self.posed.faces_of(name)
+        return None if ends is None else (dr.opaque(mi.UInt32, ends[0]), dr.opaque(mi.UInt32, ends[1]))
+
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts."""
         return self.posed.parts
 
+    @property
+    def face_ends(self) -> Ints:
+        """End of each part's triangles."""
+        return self.posed.layout.face_ends
+
     def takes(self, spec: Region, globe: Globe) -> bool:
         """Return whether a subject fits the meshes of the scene."""
-        worn = sum(len(body.faces) for body in globe.frames)
-        return not self.fixed and spec.head is None and self.spectacle_faces == worn
+        layout, bodies = self.posed.layout, globe.frames
+        vertices = int(layout.vertex_ends[-2] - layout.vertex_ends[HAIRS])
+        fits = (vertices, self.body_faces) == (sum(len(b.vertices) for b in bodies), sum(len(b.faces) for b in bodies))
+        return not self.fixed and spec.head is None and fits
 
     @property
-    def spectacle_faces(self) -> int:
-        """Number of triangles of frames of spectacles."""
-        return int(np.diff(self.posed.layout.face_ends[-3:-1])[0]) if SPECTACLES in self.parts else 0
+    def body_faces(self) -> int:
+        """Number of triangles of frames of spectacles and obstacles, which are behind those of brows."""
+        return int(self.face_ends[-2] - self.face_ends[HAIRS])
 
     def fill(self, spec: Region, globe: Globe, known: RegionMesh | None) -> None:
         """Replace the subject by one with the same shapes, so that recordings remain valid."""
@@ -122,7 +132,7 @@ class RegionScene:
     def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
         """Return the cache key of a scene: the subject, the side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
-        worn = tuple((len(body.faces), body.albedo) for body in globe.frames)
+        worn = tuple((b.part, len(b.vertices), b.albedo, hash(b.faces.tobytes())) for b in globe.frames)
         return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files, worn
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
@@ -240,6 +250,7 @@ class SkinGeometry:
         mirror: -1 for a left eye, else 1.
         thin: coordinate v of the map at which the conjunctiva has its full thickness; 0 without a map.
         spectacles: numbers of the first triangle of the frame of spectacles, and of the first one behind; None without.
+        obstacles: the same for obstacles, which follow.
     """
 
     map: Any
@@ -253,6 +264,7 @@ class SkinGeometry:
     mirror: mi.Float
     thin: mi.Float
     spectacles: tuple[mi.UInt32, mi.UInt32] | None = None
+    obstacles: tuple[mi.UInt32, mi.UInt32] | None = None
 
     @classmethod
     def of(
@@ -350,10 +362,11 @@ class SkinGeometry:
 
     def on_spectacles(self, face: mi.UInt32) -> mi.Bool:
         """Return whether a triangle belongs to the frame of spectacles."""
-        if self.spectacles is None:
-            return mi.Bool(False)
-        first, last = self.spectacles
-        return (face >= first) & (face < last)
+        return _within(face, self.spectacles)
+
+    def on_obstacles(self, face: mi.UInt32) -> mi.Bool:
+        """Return whether a triangle belongs to an obstacle."""
+        return _within(face, self.obstacles)
 
     def corner(self, face: mi.UInt32, uv: mi.Point2f, u: mi.Float, active: mi.Bool) -> mi.UInt32:
         """Choose a vertex of triangles at random, by barycentric weight, from a uniform u in [0, 1)."""
@@ -378,6 +391,8 @@ class SkinGeometry:
         place, turned = self._mixed(corners, 0, active), self._mixed(corners, 1, active)
         for weight, i in corners:
             received += weight * dr.gather(mi.Vector4f, self.received, i, active)
+        if self.obstacles is not None:  # they exchange no light
+            received = dr.select(self.on_obstacles(face), mi.Vector4f(0, 1, 0, 0), received)
         albedo, slope_y, slope_z, gloss = (mi.Float(c) for c in self.map.eval(mi.Point2f(place.w, turned.w), active))
         smooth = dr.normalize(mi.Vector3f(turned.x, turned.y, turned.z))
         normal = self.tilted(smooth, slope_y, slope_z)
@@ -387,16 +402,11 @@ class SkinGeometry:
         )  # fmt: skip
 
 
+def _within(face: mi.UInt32, ends: tuple[mi.UInt32, mi.UInt32] | None) -> mi.Bool:
+    return mi.Bool(False) if ends is None else (face >= ends[0]) & (face < ends[1])
+
+
 def _sheet_vertex(row: mi.UInt32, column: mi.UInt32) -> mi.UInt32:
     """Return the numbers of vertices of the sheet, as in `mesh.sheet_vertices`."""
     half = COLUMNS // 2
     return dr.select(row > FINE, half * (FINE + 1) + (half + 1) * row + (column >> 1), SHEET_COLUMNS * row + column)
-
-
-def blockers(place: RegionScene, a: Floats, b: Floats) -> list[str | None]:
-    """Return the first part of the region between points (n, 3) a and b of the scene's frame; None if there is none."""
-    hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
-    valid, face = hit.is_valid(), place.skin.face(hit)
-    dr.eval(valid, face)
-    which = np.searchsorted(place.posed.layout.face_ends, face.numpy(), side="right")
-    return [place.parts[int(w)] if v else None for v, w in zip(valid.numpy(), which, strict=True)]

@@ -213,7 +213,7 @@ def _patch_on_skin(
     inner = frame.region.from_behind(face, hit.prim_uv, d, view.other)
     corner = frame.region.corner(face, hit.prim_uv, s, view.other)
     which = dr.gather(mi.Int32, tables.stands_for, 2 * corner + dr.select(inner, 1, 0), view.other)
-    matte = view.other & (~inner | (which >= mi.Int32(tables.on_skin)))
+    matte = view.other & ~frame.region.on_obstacles(face) & (~inner | (which >= mi.Int32(tables.on_skin)))
     sheet = view.other & frame.region.on_sheet(face)
     return tables.on_globe + mi.UInt32(which), matte, sheet & ~inner, sheet & inner
 

@@ -60,7 +60,7 @@ def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     """
     ends = mesh.layout.vertex_ends
     solid = np.arange(ends[0])
-    if len(ends) > 4:  # a head mesh: what is neither hair nor tears
+    if "head" in mesh.parts:  # what is neither hair nor tears
         solid = np.append(solid, np.arange(ends[3], ends[4]))
     # Coordinates (n, 4) of vertices: their points (mm), and a fourth one that grows across the lid margins.
     height = globe.clearance(mesh.vertices * globe.mirror)

@@ -58,7 +58,7 @@ class ShadowMaps:
         if not skin.is_sheet:
             return cls(table=views, known=known, marks=dr.zeros(mi.UInt8, 1))
         pieces = _pieces(region.posed)
-        counts = region.sheet_faces, len(pieces), region.spectacle_faces
+        counts = region.sheet_faces, len(pieces), region.body_faces
         on_device = tuple(dr.opaque(mi.UInt32, count) for count in counts)
         hairs = upload_array(pieces if len(pieces) else np.zeros(8))
         return cls(table=views, known=known, marks=_marked(views, skin, hairs, on_device, counts, len(table)))
@@ -77,12 +77,12 @@ def _marked(
     table: mi.Float, skin: SkinGeometry, hairs: mi.Float, on_device: tuple[mi.UInt32, ...],
     counts: tuple[int, ...], lamps: int,
 ) -> mi.UInt8:  # fmt: skip
-    """Compute the marks of all lamps, from triangles of the sheet, pieces of hairs, and frames of spectacles.
+    """Compute the marks of all lamps, from triangles of the sheet, pieces of hairs, and bodies before the eye.
 
     Their `counts` are passed on the device too, otherwise they would be compiled into the kernels.
     """
     marks = dr.zeros(mi.UInt8, max(lamps, 1) * _CELLS * _CELLS)
-    for count, number, mark in zip(counts, on_device, (_mark_triangles, _mark_hairs, _mark_spectacles), strict=True):
+    for count, number, mark in zip(counts, on_device, (_mark_triangles, _mark_hairs, _mark_bodies), strict=True):
         if count and lamps:
             index = dr.arange(mi.UInt32, count * lamps)
             lamp = index // number
@@ -98,17 +98,19 @@ def _mark_triangles(
     normal = dr.cross(b - a, c - a)
     limit = view.radius * dr.norm(normal)
     front = reduce(dr.minimum, [dr.dot(normal, view.origin - corner) for corner in (a, b, c)])
+    ahead = reduce(dr.maximum, [view.ahead(corner) for corner in (a, b, c)]) > -view.radius
     places = [view.place(p) for p in (a, b, c)]
     edge = _Edge.longest([p.u for p in places], [p.v for p in places])
-    _mark(marks, lamp, places, mi.Float(0), edge, view.scale, special | (front <= limit))
+    _mark(marks, lamp, places, mi.Float(0), edge, view.scale, ahead & (special | (front <= limit)))
 
 
-def _mark_spectacles(
+def _mark_bodies(
     marks: mi.UInt8, lamp: mi.UInt32, view: _View, index: mi.UInt32, skin: SkinGeometry, hairs: mi.Float
 ) -> None:
-    """Mark the cells that triangles of frames of spectacles may cover."""
-    assert skin.spectacles is not None
-    _mark_triangles(marks, lamp, view, skin.spectacles[0] + index, skin, hairs)
+    """Mark the cells that triangles of frames of spectacles and obstacles may cover."""
+    bodies = skin.spectacles or skin.obstacles
+    assert bodies is not None
+    _mark_triangles(marks, lamp, view, bodies[0] + index, skin, hairs)
 
 
 def _mark_hairs(
@@ -193,6 +195,10 @@ class _View:
         four = [dr.gather(mi.Vector4f, table, lamp * (_WIDTH // 4) + k) for k in range(_WIDTH // 4)]
         row = [n for part in four for n in (part.x, part.y, part.z, part.w)]
         return cls(*(mi.Vector3f(*row[k : k + 3]) for k in (0, 3, 6, 9)), *row[12:15])
+
+    def ahead(self, x: mi.Vector3f) -> mi.Float:
+        """Compute how far points of the scene's frame lie before the lamp; what is behind it shades no map."""
+        return dr.dot(x - self.origin, self._axis)
 
     def place(self, x: mi.Vector3f) -> _Place:
         """Project points of the scene's frame. The map is conformal, so its scale is the same in all directions."""

@@ -10,10 +10,9 @@ import pytest
 from scipy.optimize import brentq
 
 from eyerender.rendering.glints.cutdiscs import cut_nodes, quadrature, rim
-from eyerender.rendering.scene.background import Obstacle
 from tests.support.light_tracing import basis, mirror_yz, trace_light
 from tests.support.render_oracles import centroid
-from tests.support.render_rigs import BLACK, RIGS, eye_of, job_of
+from tests.support.render_rigs import BLACK, RIGS, card, eye_of, job_of
 
 
 def segment(height: float) -> float:
@@ -108,7 +107,7 @@ def test_glints_cut_by_the_limbus_of_all_sizes(renderer, rig_name, model, radius
     assert place < 0.02
 
 
-def card(lamp, height):
+def card_before(lamp, height):
     """A large card just before a lamp, whose edge is `height` lamp radii from the lamp's centre, (4, 3) mm."""
     e1, e2 = basis(lamp.axis)
     start = lamp.position_mm + 0.05 * lamp.axis + height * lamp.radius_mm * e1
@@ -117,19 +116,16 @@ def card(lamp, height):
 
 @pytest.mark.parametrize("height", [-0.8, 0.1, 0.97])
 def test_a_card_before_a_lamp_leaves_a_segment_of_it(renderer, height):
-    from eyerender.rendering.renderer import Renderer
-
     rig = RIGS["remote"](radius_mm=2.5)
     (lamp,) = rig.lights
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    shaded = Renderer(renderer.backend, spp=1, obstacles=[Obstacle(card(lamp, height), faces)])
     job = job_of(eye_of("E2"), rig, rig.window(32, 32), look=BLACK, labels=False)
-    done, whole = shaded.render(job), renderer.render(job, spp=1)
+    shaded = replace(job, obstacles=card(card_before(lamp, height)))
+    done, whole = renderer.render(shaded, spp=1), renderer.render(job, spp=1)
     # The card is .05 mm before the lamp and the eye 600 mm away, so its edge is where it appears; the energy of the
     # lamp's points differs by 1e-4.
     assert done.glints.share[0] == pytest.approx(1 - segment(height), abs=1e-3)
     assert done.glints.energy[0] == pytest.approx(whole.glints.energy[0] * done.glints.share[0], rel=1e-9)
-    assert done.glint_reasons == ("partly occluded by head",)
+    assert done.glint_reasons == ("partly occluded by obstacle",)
 
 
 def test_a_glint_whose_centre_is_off_the_cornea_is_labelled_as_the_picture_shows_it(renderer):

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from eyerender.rendering.glints.tracing import _roughly
-from eyerender.rendering.scene.background import Obstacle
 from eyerender.rig.sensor import Sensor
 from tests.support.light_tracing import trace_backward
 from tests.support.render_oracles import centroid, mirror_pixel
-from tests.support.render_rigs import BLACK, MODELS, RIGS, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_rigs import BLACK, MODELS, RIGS, card, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize("rig_name", RIGS)
@@ -69,15 +68,12 @@ def test_energy_does_not_depend_on_the_point_spread_function(renderer):
 
 
 def test_an_obstacle_before_the_lamp_takes_the_glint_and_its_light_away(renderer):
-    from eyerender.rendering.renderer import Renderer
-
     rig = head_rig()
     eye = eye_of("E2")
     lamp = rig.lights[0].position_mm
-    card = 0.8 * lamp + 1.5 * np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1.0]])
-    shaded = Renderer(renderer.backend, spp=4, obstacles=[Obstacle(card, np.array([[0, 1, 2], [0, 2, 3]]))])
+    corners = 0.8 * lamp + 1.5 * np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1.0]])
     job = job_of(eye, rig, (0, 0, 640, 480))
-    open_, hidden = renderer.render(job, spp=4), shaded.render(job)
+    open_, hidden = renderer.render(job, spp=4), renderer.render(replace(job, obstacles=card(corners)), spp=4)
     assert open_.glints.visible.all()
     assert hidden.glints.visible.tolist() == [False] + [True] * 5
     np.testing.assert_allclose(hidden.glints.energy[1:], open_.glints.energy[1:])

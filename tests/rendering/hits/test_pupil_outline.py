@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from eyerender.rendering.scene.background import Obstacle
+from eyerender.scene.parts import FRAME
 from tests.support.render_oracles import contour_error, outline
-from tests.support.render_rigs import PLAIN, RIGS, depths_mm, eye_of, head_rig, job_of, remote_rig
+from tests.support.render_rigs import PLAIN, RIGS, card, depths_mm, eye_of, head_rig, job_of, remote_rig
 
 
 @pytest.mark.parametrize(
@@ -53,16 +55,14 @@ def test_labels_show_the_pupil_through_the_cornea(renderer):
 
 
 def test_amodal_labels_see_through_an_obstacle(renderer):
-    from eyerender.rendering.renderer import Renderer
-
     rig = head_rig()
     eye = eye_of("E2")
     job = job_of(eye, rig, (0, 0, 640, 480))
-    card = np.array([[2.0, y, z] for y, z in ((-20, -20), (20, -20), (20, -2.2), (-20, -2.2))])
-    other = Renderer(renderer.backend, obstacles=[Obstacle(card, np.array([[0, 1, 2], [0, 2, 3]]))])
-    hidden, open_ = other.labels(job), renderer.labels(job)
+    corners = np.array([[2.0, y, z] for y, z in ((-20, -20), (20, -20), (20, -2.2), (-20, -2.2))])
+    behind = replace(job, obstacles=card(corners))
+    hidden, open_ = renderer.labels(behind), renderer.labels(job)
     np.testing.assert_array_equal(hidden.amodal, open_.amodal)
     assert 0.2 < hidden.visible_fraction(3) < 0.8
-    covered = (open_.part != 0) & (hidden.part == 0)
-    assert np.all(depths_mm(other, job)[covered] < depths_mm(renderer, job)[covered])
-    assert np.all(hidden.part[hidden.part != 0] == open_.part[hidden.part != 0])
+    covered = hidden.part == FRAME
+    assert np.all(depths_mm(renderer, behind)[covered] < depths_mm(renderer, job)[covered])
+    assert np.all(hidden.part[~covered] == open_.part[~covered])

@@ -1,0 +1,56 @@
+"""What hides features besides the eye itself: obstacles of the rig, and openings that frame a camera's picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from ..base.arrays import Body, Bools, Floats, Statuses
+from ..base.status import Status, mark
+from ..optics.triangles import tree_of
+from ..rig.camera import PinholeCamera
+from ..rig.imaging import Opening
+from ..rig.rig import RigGeometry
+from ..rig.stray import hidden_at
+
+
+@dataclass(frozen=True, slots=True)
+class Occluders:
+    """Obstacles, which block light on its way to the eye and to the camera, and openings, which hide parts of pictures.
+
+    Lids and lashes are not among them, nor are frames of spectacles.
+    """
+
+    bodies: tuple[Body, ...]
+    openings: tuple[Opening, ...]
+
+    @classmethod
+    def of(cls, rig: RigGeometry, openings: tuple[Opening, ...]) -> Self | None:
+        """Return what hides features of a rig behind openings; None if nothing does."""
+        return cls(rig.obstacles, openings) if rig.obstacles or openings else None
+
+    def blocking(self, points_mm: Floats, camera: PinholeCamera, lights_mm: Floats | None = None) -> Bools:
+        """Return which points (n, k, 3) of eyes obstacles hide from a camera or from their lights (k, 3), (n, k)."""
+        if not self.bodies:
+            return np.zeros(points_mm.shape[:-1], dtype=bool)
+        tree = tree_of(*self.bodies)
+        hidden = tree.blocks(camera.nodal_point_mm, points_mm)
+        return hidden if lights_mm is None else hidden | tree.blocks(lights_mm, points_mm)
+
+    def mark(
+        self, status: Statuses, pixels: Floats, points_mm: Floats, camera: PinholeCamera, lights_mm: Floats | None
+    ) -> None:
+        """Mark, in place, the status of hidden features (n, k), and set their pixels (n, k, 2) to NaN.
+
+        Args:
+            status: of the features.
+            pixels: their places in the camera's picture.
+            points_mm: (n, k, 3) where their light leaves the eyes, in the world.
+            camera: the camera.
+            lights_mm: (k, 3) the light of each glint; None for other features.
+        """
+        mark(status, self.blocking(points_mm, camera, lights_mm), Status.BEHIND_OBSTACLE)
+        mark(status, hidden_at(self.openings, camera, pixels), Status.BEHIND_OPENING)
+        pixels[status != Status.OK] = np.nan

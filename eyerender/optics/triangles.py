@@ -1,0 +1,65 @@
+"""Bodies of triangles between two points: a tree of boxes around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from ..base.arrays import ArrayValue, Body, Bools, Floats, frozen, remembered
+
+_FEW = 8  # triangles of a leaf at most
+_MARGIN_MM = 1e-3  # left out at both ends of a line, as in pictures
+_ROUNDING_MM = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleTree(ArrayValue):
+    """Triangles in a complete binary tree of boxes; the fields are those of `triangle_kernels.meet_between`."""
+
+    boxes: Floats
+    corners: Floats
+    leaf: int
+
+    @classmethod
+    def of(cls, bodies: Sequence[Body]) -> Self:
+        """Sort the triangles of bodies: each node's are halved at the median of the longer axis of their centres."""
+        points = np.concatenate([body.vertices[body.faces] for body in bodies])
+        levels = max(int(np.ceil(np.log2(len(points) / _FEW))), 0)
+        leaf = -(-len(points) // 2**levels)
+        # The last triangle is repeated, so that all leaves have as many.
+        order = np.minimum(np.arange(leaf * 2**levels), len(points) - 1)[None]
+        middle = points.mean(axis=1)
+        for _ in range(levels):
+            places = middle[order]
+            axis = np.ptp(places, axis=1).argmax(axis=1)
+            along = np.take_along_axis(places, axis[:, None, None], axis=2)[..., 0]
+            order = np.take_along_axis(order, np.argsort(along, axis=1, kind="stable"), axis=1)
+            order = order.reshape(2 * len(order), -1)
+        points = points[order.ravel()]
+        each = points.reshape(2**levels, -1, 3)
+        boxes = [np.stack([each.min(axis=1) - _ROUNDING_MM, each.max(axis=1) + _ROUNDING_MM], axis=1)]
+        for _ in range(levels):
+            pairs = boxes[0].reshape(-1, 2, 2, 3)
+            boxes.insert(0, np.stack([pairs[:, :, 0].min(axis=1), pairs[:, :, 1].max(axis=1)], axis=1))
+        edges = np.stack([points[:, 0], points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]], axis=1)
+        return cls(frozen(np.concatenate(boxes)), frozen(edges), leaf)
+
+    def blocks(self, start_mm: Floats, end_mm: Floats) -> Bools:
+        """Return whether any triangle lies between points (..., 3); False where one is NaN."""
+        # Compiled functions, and numba itself, are loaded only where something may block light.
+        from .triangle_kernels import meet_between
+
+        start, end = np.broadcast_arrays(start_mm, end_mm)
+        out = np.empty(start.shape[:-1], dtype=bool)
+        lines = (np.ascontiguousarray(points.reshape(-1, 3), dtype=np.float64) for points in (start, end))
+        meet_between(np.array(self.boxes), np.array(self.corners), self.leaf, *lines, _MARGIN_MM, out.reshape(-1))
+        return out
+
+
+@remembered
+def tree_of(*bodies: Body) -> TriangleTree:
+    """Return the tree of bodies, which are the same objects from frame to frame."""
+    return TriangleTree.of(bodies)
