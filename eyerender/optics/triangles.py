@@ -13,6 +13,7 @@ from ..base.arrays import ArrayValue, Body, Bools, Floats, frozen, remembered
 _FEW = 8  # triangles of a leaf at most
 _MARGIN_MM = 1e-3  # left out at both ends of a line, as in pictures
 _ROUNDING_MM = 1e-9
+_SHARP_RAD, _MOST_DRAWN = 0.35, 4000  # of edges that drawings show
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +58,17 @@ class TriangleTree(ArrayValue):
         lines = (np.ascontiguousarray(points.reshape(-1, 3), dtype=np.float64) for points in (start, end))
         meet_between(np.array(self.boxes), np.array(self.corners), self.leaf, *lines, _MARGIN_MM, out.reshape(-1))
         return out
+
+
+@remembered
+def sharp_edges(body: Body) -> Floats:
+    """Return edges (n, 2, 3) mm of a body for drawings: where it bends, or evenly chosen ones if they are too many."""
+    import trimesh  # its import takes a quarter of a second, and few processes need it
+
+    mesh = trimesh.Trimesh(body.vertices, body.faces)
+    bends = mesh.face_adjacency_edges[mesh.face_adjacency_angles > _SHARP_RAD]
+    edges = bends if len(bends) else mesh.edges_unique
+    return frozen(mesh.vertices[edges[:: 1 + len(edges) // _MOST_DRAWN]])
 
 
 @remembered

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..analytic.observer import trace
 from ..base.arrays import Floats
+from ..optics.triangles import sharp_edges
 from ..rig.camera import PinholeCamera
 from ..scene import Scene
 from ..scene.observation import EYES, Observations
@@ -15,11 +16,11 @@ from .style import ANALYTIC, IMAGE, TARGET, figure
 
 MAX_NOTES = 4
 """Largest number of reasons for missing rays that a figure lists."""
-_LIGHT, _SIGHT, _SCREEN = "#E69F00", "#CC79A7", "#777777"
+_LIGHT, _SIGHT, _SCREEN, _OBSTACLE = "#E69F00", "#CC79A7", "#777777", "#555555"
 
 
 def scene_view(scene: Scene) -> Any:
-    """Draw a scene as a matplotlib figure: eyes, screen with targets, cameras, lights.
+    """Draw a scene as a matplotlib figure: eyes, screen with targets, cameras, lights, obstacles.
 
     For the first fixation of the first head position it adds the lines of sight, and the rays of glint and pupil centre
     to each camera.
@@ -35,6 +36,9 @@ def scene_view(scene: Scene) -> Any:
             _camera(ax, scene, k)
         lights = np.array([light.position_mm for light in scene.rig.lights])
         ax.scatter(*lights.T, color=_LIGHT, s=40, depthshade=False, label="infrared LED")
+        for k, body in enumerate(scene.rig.obstacles):
+            lines = np.pad(sharp_edges(body), [(0, 0), (0, 1), (0, 0)], constant_values=np.nan).reshape(-1, 3)
+            ax.plot(*lines.T, color=_OBSTACLE, lw=0.7, label=None if k else "obstacle")
         for n, row in enumerate(rows):
             _eye(ax, scene, seen, int(row), first=n == 0)
         _equal(ax)

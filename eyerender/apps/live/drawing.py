@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ...base.arrays import Floats
 from ...eye.model import EyeModel
 from ...imaging.capture import eye_motion
+from ...optics.triangles import sharp_edges
 from ...region.limbus import lower
 from ...report.style import ANALYTIC, IMAGE, TARGET
 from ...rig.camera import PinholeCamera
@@ -19,7 +20,7 @@ from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 
 LIGHT, SIGHT, SCREEN, GLOBE, LIMBUS = "#E69F00", "#CC79A7", "#7A7A7A", "#B9B9B9", "#8A6D4B"
-CAMERA, AXIS = "#5B3A8C", "#009E73"
+CAMERA, AXIS, OBSTACLE = "#5B3A8C", "#009E73", "#555555"
 PUPIL = "#1c1c1c"
 LEGEND = (
     ("camera and its window", CAMERA),
@@ -90,6 +91,9 @@ def strokes(frames: Frames, truth: Observations, row: int) -> Strokes:
     for k, lamp in enumerate(scene.rig.lights):
         _lamp(out, lamp, k, frames)
     _screen(out, scene, frames)
+    for k, body in enumerate(scene.rig.obstacles):
+        out.pairs(sharp_edges(body), OBSTACLE, 1.0)
+        out.label(f"obstacle {k}", body.vertices[0], OBSTACLE)
     for other in np.flatnonzero(frames.index.camera == shown):
         _eye(out, frames, int(other), shown=int(other) == row)
     _rays(out, frames, truth, row)
