@@ -29,7 +29,7 @@ class Occluders:
     @classmethod
     def of(cls, rig: RigGeometry, openings: tuple[Opening, ...]) -> Self | None:
         """Return what hides features of a rig behind openings; None if nothing does."""
-        return cls(rig.obstacles, openings) if rig.obstacles or openings else None
+        return cls(rig.bodies(), openings) if rig.obstacles or openings else None
 
     def blocking(self, points_mm: Floats, camera: PinholeCamera, lights_mm: Floats | None = None) -> Bools:
         """Return which points (n, k, 3) of eyes obstacles hide from a camera or from their lights (k, 3), (n, k)."""

@@ -31,6 +31,7 @@ def _names(scene: Mapping[str, Any], base: Path) -> Iterator[str]:
     yield from _texts(scene, "ambient", "map", "file")
     yield from _texts(scene, "rig", "cameras", "calibration", "file")
     yield from _texts(scene, "rig", "calibration", "file")
+    yield from _texts(scene, "rig", "obstacles", "file")
     yield from _texts(scene, "region", "head", "texture")
     for name in _texts(scene, "region", "head", "file"):
         yield name

@@ -239,7 +239,7 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         seed=int(seeds.generate_state(1, np.uint64)[0]),
         apex_mm=index.eye_position_mm[row] + index.head_mm[row],
         focus_dpt=focus_dpt(frames, row),
-        obstacles=scene.rig.obstacles,
+        obstacles=scene.rig.bodies(),
     )
 
 

@@ -36,7 +36,7 @@ def scene_view(scene: Scene) -> Any:
             _camera(ax, scene, k)
         lights = np.array([light.position_mm for light in scene.rig.lights])
         ax.scatter(*lights.T, color=_LIGHT, s=40, depthshade=False, label="infrared LED")
-        for k, body in enumerate(scene.rig.obstacles):
+        for k, body in enumerate(scene.rig.bodies()):
             lines = np.pad(sharp_edges(body), [(0, 0), (0, 1), (0, 0)], constant_values=np.nan).reshape(-1, 3)
             ax.plot(*lines.T, color=_OBSTACLE, lw=0.7, label=None if k else "obstacle")
         for n, row in enumerate(rows):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Protocol, Self
@@ -184,19 +183,8 @@ class Rig(Spec):
             return self
         return self.model_copy(update={"obstacles": tuple(obstacle.located(base) for obstacle in self.obstacles)})
 
-    def _bodies(self) -> Iterator[Body]:
-        for k, obstacle in enumerate(self.obstacles):
-            try:
-                yield obstacle.build(self.mount)
-            except InputError as error:
-                raise error.placed(under=f"rig.obstacles.{k}") from None
-
     def build(self) -> RigGeometry:
-        """Build the numeric rig.
-
-        Raises:
-            InputError: the file of an obstacle cannot be read.
-        """
+        """Build the numeric rig."""
         if self.calibration is not None:
             return self.resolved().build()
         cameras = tuple(camera.build() for camera in self.cameras)
@@ -206,7 +194,7 @@ class Rig(Spec):
         if self.mount is not None:
             cameras = tuple(map(self.mount.camera, cameras))
             lights = tuple(map(self.mount.lamp, lights))
-        return RigGeometry(cameras, lights, self.screen.build() if self.screen else None, tuple(self._bodies()))
+        return RigGeometry(cameras, lights, self.screen.build() if self.screen else None, self.obstacles, self.mount)
 
 
 class RigLike(Protocol):
@@ -222,16 +210,34 @@ class RigLike(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry(ArrayValue):
-    """Cameras, lights, the screen, if there is one, and obstacles, which `to_mapping` leaves out."""
+    """Cameras, lights, the screen, if there is one, and obstacles, which `to_mapping` leaves out.
+
+    Obstacles are as authored, before the mount moves them: files are read where their bodies are needed.
+    """
 
     cameras: tuple[PinholeCamera, ...]
     lights: tuple[Lamp, ...]
     screen: ScreenPlane | None
-    obstacles: tuple[Body, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
+    mount: Mount | None = None
 
     def build(self) -> RigGeometry:
         """Return this rig, which is already numeric."""
         return self
+
+    def bodies(self) -> tuple[Body, ...]:
+        """Build the obstacles in the world; the same objects until a file changes.
+
+        Raises:
+            InputError: the file of an obstacle cannot be read.
+        """
+        out = []
+        for k, obstacle in enumerate(self.obstacles):
+            try:
+                out.append(obstacle.build(self.mount))
+            except InputError as error:
+                raise error.placed(under=f"rig.obstacles.{k}") from None
+        return tuple(out)
 
     def lights_of(self, eye: int) -> tuple[int, ...]:
         """Return the numbers of the lights that light an eye: 0 right, 1 left, -1 unknown (then all)."""

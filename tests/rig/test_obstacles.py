@@ -81,9 +81,9 @@ def test_obstacles_move_with_the_rig_and_stay_where_lights_change():
     still = er.Rig.from_mapping({**RIG, "obstacles": [{"ring": RING}]})
     moved = er.Rig.from_mapping({**still.to_mapping(), "mount": mount})
     lamp, other = still.build().lights[0], moved.build().lights[0]
-    for a, b in zip(still.build().obstacles[0].vertices[::97], moved.build().obstacles[0].vertices[::97], strict=True):
+    for a, b in zip(still.build().bodies()[0].vertices[::97], moved.build().bodies()[0].vertices[::97], strict=True):
         assert np.linalg.norm(a - lamp.position_mm) == pytest.approx(np.linalg.norm(b - other.position_mm), abs=1e-9)
-    assert moved.build().obstacles == (Mount.from_mapping(mount).body(still.build().obstacles[0]),)
+    assert moved.build().bodies() == (Mount.from_mapping(mount).body(still.build().bodies()[0]),)
     assert still.with_light(0, moved_mm=(0, 1, 0)).obstacles == still.obstacles
     assert er.Rig.from_mapping(RIG).build().obstacles == ()
 
@@ -114,7 +114,7 @@ def test_files_that_cannot_be_obstacles_end_with_one_line(tmp_path):
                               ("far.stl", "m", "with unit m, reaches"), ("a.txt", "mm", "no such file")):  # fmt: skip
         rig = er.Rig.from_mapping({**RIG, "obstacles": [{"file": file, "unit": unit}]}).located(tmp_path)
         with pytest.raises(InputError, match=words) as error:
-            rig.build()
+            rig.build().bodies()
         assert error.value.path == "rig.obstacles.0.file"
     mirror = {"point_mm": [30, 0, 0], "normal": [1, 0, 1]}
     with pytest.raises(InputError, match="obstacles: cannot be given with a camera that looks past a mirror"):

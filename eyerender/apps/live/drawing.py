@@ -91,7 +91,7 @@ def strokes(frames: Frames, truth: Observations, row: int) -> Strokes:
     for k, lamp in enumerate(scene.rig.lights):
         _lamp(out, lamp, k, frames)
     _screen(out, scene, frames)
-    for k, body in enumerate(scene.rig.obstacles):
+    for k, body in enumerate(scene.rig.bodies()):
         out.pairs(sharp_edges(body), OBSTACLE, 1.0)
         out.label(f"obstacle {k}", body.vertices[0], OBSTACLE)
     for other in np.flatnonzero(frames.index.camera == shown):
