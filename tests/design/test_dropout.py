@@ -104,3 +104,30 @@ def test_blur_and_motion_make_features_noisier():
     assert sharp.glint_px[0, 0] < blurred[0].glint_px[0, 0]
     moving = sensor_noise(scene.with_({"motion": {"eye_deg_s": [200.0, 0.0]}}))
     assert moving.outline_px[0] > 1.05 * sharp.outline_px[0]
+
+
+def test_obstacles_and_openings_cost_the_rig_what_they_cost_features():
+    """Each of 72 glints and 144 points of outlines, for the same person in front of the same rig."""
+    data = ring_scene()
+    ring = {"centre_mm": [11, -38, -2], "inner_radius_mm": 4.0, "outer_radius_mm": 9.0, "depth_mm": 2.0}
+    data["rig"] = {**data["rig"], "obstacles": [{"ring": ring}]}
+    data["lens"] = {"openings": [{"centre": [0.02, -0.1], "half_size": [2.0, 0.16], "power": 8, "edge_px": 1}]}
+    survey, one = survey_and_one(data, 5, 1.0)
+    spec = SceneSpec.from_mapping(survey.scene)
+    case = people._case(survey, (rig := Scene.of(spec).rig), [one])
+    views, theta = replace(case.instants.take(CELLS), camera=np.zeros(9, np.int64)), case.theta[CELLS]
+    free = np.zeros(COUNT, dtype=bool)
+    left, why = people.seen_features(views, theta, rig.cameras[0], (None, survey.occluders), free)
+    subject = er.Subject.of(
+        er.Population("adults").person(5, 0), eyes=("right",), ipd_mm=63.0, luminance_cd_m2=20.0,
+        accommodation_d=0.0, head_positions_mm=(tuple((one.place_mm - [0.0, -31.5, 0.0]).tolist()),),
+    )  # fmt: skip
+    poses = er.EyeDirection.listed(survey.directions_deg[CELLS])
+    seen = er.trace(er.Scene(subject, spec.rig, poses=poses, lens=spec.lens), boundary_points=people.POINTS)
+    assert np.array_equal(left.glint_ok, seen.glints.ok & seen.glints.in_image)
+    found = np.isfinite(seen.pupil.points_px).all(axis=2)
+    assert np.array_equal(left.outline_ok, found)
+    assert why.shape == (9, len(people.LOST))
+    for status, column in ((er.Status.BEHIND_OBSTACLE, 3), (er.Status.BEHIND_OPENING, 4)):
+        assert why[:, column].sum() == (seen.glints.status == status).sum() > 1
+    assert 0.2 < found.mean() < 0.95

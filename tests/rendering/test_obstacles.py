@@ -26,7 +26,12 @@ from tests.support.render_rigs import PLAIN, LampRig, eye_of, job_of
 
 FLAT = PLAIN.model_copy(update={"tear_film": False, "scattering": None, "limbus_width_mm": 0.0, "sclera_albedo": 0.6})
 HAIRLESS = Region.from_mapping(
-    {"skin": {"map": "off"}, "lashes": {"upper_count": 0, "lower_count": 0}, "brow": {"count": 0}}
+    {
+        "skin": {"map": "off"},
+        "lashes": {"upper_count": 0, "lower_count": 0},
+        "brow": {"count": 0},
+        "tears": {"height_mm": 0.0},
+    }
 )
 
 
@@ -171,7 +176,9 @@ def test_shadow_and_edge_of_an_obstacle_against_path(renderer, tmp_path, region)
         error = np.hypot.reduce(noise[inside]) / inside.sum() / truth[inside].mean()
         assert error < 0.002
         assert away < 0.005 + 2 * error, (kind, away, error)
-    body_edge = ndimage.binary_dilation(part == FRAME, iterations=3) & ~ndimage.binary_erosion(part == FRAME, iterations=3)
+    body_edge = ndimage.binary_dilation(part == FRAME, iterations=3) & ~ndimage.binary_erosion(
+        part == FRAME, iterations=3
+    )
     dark = (share < 0.5) & (part == BACKGROUND)
     assert dark.sum() > 500
     shade_edge = ndimage.binary_dilation(dark, iterations=3) & ~ndimage.binary_erosion(dark, iterations=3)

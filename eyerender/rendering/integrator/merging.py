@@ -109,6 +109,9 @@ def _weighted_hit(frame: DeviceFrame, group: PixelGroup, j: mi.UInt32) -> Weight
         own_ray &= ~on_sheet
     else:
         own_ray &= ~on_sheet | group.sharp | (x.y * x.y + x.z * x.z < _LIDS_MM * _LIDS_MM)
+    if frame.region.obstacles is not None:
+        # Their edges are sharp: the merged point's light must not be weighted with the shadow on another side.
+        own_ray &= ~frame.region.on_obstacles(hit.prim_index)
     if group.layered:
         along = group.ray(frame, dr.select(group.plain, group.in_order(mi.UInt32(0)), j))[1]
         near = weight * dr.rcp(dr.maximum(hit.t * frame.axis_cosine(along), 1e-3))
