@@ -243,7 +243,7 @@ BOUNDS = {
     "analytic": 1045,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 17040,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 1005,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
-    "base": 2650,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
+    "base": 2660,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
     "dataset": 11090,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3530,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
@@ -313,6 +313,7 @@ LARGE = {
 POSITIONAL = {
     "Biconic", "BoundaryPixels", "CalibrationErrors", "Descent", "DeviceSurface", "EyeImage", "EyePicture",
     "Finding", "FunctionErrors", "GradientMedium", "GridSurface", "GuestrinEizenman", "LashPlan", "Patch", "Quadric",
+    "RegionLayout", "RigGeometry",
     "Regression", "Scene", "Score", "Stop", "Table", "ZernikeSurface", "_Table",
 }  # fmt: skip
 

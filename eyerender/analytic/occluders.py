@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from ..base.arrays import Body, Bools, Floats, Statuses
+from ..base.arrays import Body, Floats, Statuses
 from ..base.status import Status, mark
 from ..optics.triangles import tree_of
 from ..rig.camera import PinholeCamera
@@ -31,14 +31,6 @@ class Occluders:
         """Return what hides features of a rig behind openings; None if nothing does."""
         return cls(rig.bodies(), openings) if rig.obstacles or openings else None
 
-    def blocking(self, points_mm: Floats, camera: PinholeCamera, lights_mm: Floats | None = None) -> Bools:
-        """Return which points (n, k, 3) of eyes obstacles hide from a camera or from their lights (k, 3), (n, k)."""
-        if not self.bodies:
-            return np.zeros(points_mm.shape[:-1], dtype=bool)
-        tree = tree_of(*self.bodies)
-        hidden = tree.blocks(camera.nodal_point_mm, points_mm)
-        return hidden if lights_mm is None else hidden | tree.blocks(lights_mm, points_mm)
-
     def mark(
         self, status: Statuses, pixels: Floats, points_mm: Floats, camera: PinholeCamera, lights_mm: Floats | None
     ) -> None:
@@ -51,6 +43,10 @@ class Occluders:
             camera: the camera.
             lights_mm: (k, 3) the light of each glint; None for other features.
         """
-        mark(status, self.blocking(points_mm, camera, lights_mm), Status.BEHIND_OBSTACLE)
+        if self.bodies:
+            tree = tree_of(*self.bodies)
+            mark(status, tree.blocks(camera.nodal_point_mm, points_mm), Status.BEHIND_OBSTACLE)
+            if lights_mm is not None:
+                mark(status, tree.blocks(lights_mm, points_mm), Status.BEHIND_OBSTACLE)
         mark(status, hidden_at(self.openings, camera, pixels), Status.BEHIND_OPENING)
         pixels[status != Status.OK] = np.nan

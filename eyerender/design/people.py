@@ -23,7 +23,7 @@ import numpy as np
 from ..analytic.features import View
 from ..analytic.occluders import Occluders
 from ..analytic.rays import glint_exits, pupil_exits
-from ..base.arrays import ArrayValue, Bools, Floats, Indices, Ints, Statuses
+from ..base.arrays import ArrayValue, Bools, Floats, Indices, Ints
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import structure_of, take_eyes
@@ -252,16 +252,16 @@ def seen_features(
     """
     openings, occluders = hidden_by
     slopes = slopes_of(views, theta, POINTS, free)
-    if openings is None and occluders is None:
-        left, why = visible(slopes, camera, None)
-        return left, np.pad(why, [(0, 0), (0, len(LOST) - why.shape[1])])
-    outline, mirror = surface_points(views, theta)
+    outline, mirror = (None, None) if openings is None and occluders is None else surface_points(views, theta)
     left, why = visible(slopes, camera, openings, mirror, views.lights_mm)
-    on_outline, of_glints = (np.zeros(points.shape[:2], np.int8) for points in (outline, mirror))
-    if occluders is not None:
+    on_outline, of_glints = (np.zeros(ok.shape, np.int8) for ok in (left.outline_ok, left.glint_ok))
+    if occluders is not None and outline is not None and mirror is not None:
         occluders.mark(on_outline, slopes.images.outline_px.copy(), outline, camera, None)
         occluders.mark(of_glints, slopes.images.glints_px.copy(), mirror, camera, views.lights_mm)
-    return _unobstructed(left, why, on_outline, of_glints)
+    reasons = (Status.BEHIND_OBSTACLE, Status.BEHIND_OPENING)
+    lost = [np.count_nonzero(left.glint_ok & (of_glints == reason), axis=1) for reason in reasons]
+    shown = (left.outline_ok & (on_outline == Status.OK), left.glint_ok & (of_glints == Status.OK))
+    return replace(left, outline_ok=shown[0], glint_ok=shown[1]), np.column_stack([why, *lost])
 
 
 def surface_points(views: Views, theta: Floats) -> tuple[Floats, Floats]:
@@ -271,23 +271,9 @@ def surface_points(views: Views, theta: Floats) -> tuple[Floats, Floats]:
     view = View.of(eye, Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), views.position_mm, camera)
     outline, _, seen = pupil_exits(eye, POINTS, view.camera_mm)
     glints, _, mirrored = glint_exits(eye, 1, view.into_eye(views.lights_mm), view.camera_mm)
-    points = [
-        np.where((status == Status.OK)[..., None], view.in_world(exits), np.nan)
-        for exits, status in ((outline, seen), (glints, mirrored))
-    ]
+    rays = (outline, seen), (glints, mirrored)
+    points = [np.where((status == Status.OK)[..., None], view.in_world(exits), np.nan) for exits, status in rays]
     return points[0][:, :-1], points[1]
-
-
-def _unobstructed(slopes: FeatureSlopes, why: Ints, outline: Statuses, glints: Statuses) -> tuple[FeatureSlopes, Ints]:
-    """Remove features (n, k) and (n, m) that obstacles and openings hide, and count the glints that this takes away."""
-    lost = [
-        np.count_nonzero(slopes.glint_ok & (glints == status), axis=1)
-        for status in (Status.BEHIND_OBSTACLE, Status.BEHIND_OPENING)
-    ]
-    left = replace(
-        slopes, outline_ok=slopes.outline_ok & (outline == Status.OK), glint_ok=slopes.glint_ok & (glints == Status.OK)
-    )
-    return left, np.column_stack([why, *lost])
 
 
 def _nobody(refused: list[int]) -> Figures:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
 from ..base.errors import InputError
 from ..base.storage.files import parse_json, read_bytes, shown
 from .ply import plain_ply
@@ -145,17 +144,3 @@ def _check(mesh: trimesh.Trimesh, name: str, source: str) -> None:
         raise InputError(f"object {name} holds coordinates that are not finite", source=source)
     if f.min() < 0 or f.max() >= len(v):
         raise InputError(f"object {name} has faces without vertices", source=source)
-
-
-def smooth_normals(vertices: Floats, faces: Ints) -> Floats:
-    """Compute unit normals of the vertices, equal for vertices at one position, so that texture seams do not show."""
-    import trimesh
-
-    _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)
-    same = np.ravel(same)
-    merged = trimesh.Trimesh(vertices[first], same[faces], process=False)
-    normals = np.array(merged.vertex_normals)[same]
-    # A vertex without any area around it has no normal.
-    lost = ~(np.linalg.norm(normals, axis=1) > 0.5)
-    normals[lost] = (1.0, 0.0, 0.0)
-    return normals

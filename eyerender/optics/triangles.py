@@ -50,20 +50,20 @@ class TriangleTree(ArrayValue):
 
     def blocks(self, start_mm: Floats, end_mm: Floats) -> Bools:
         """Return whether any triangle lies between points (..., 3); False where one is NaN."""
-        # Compiled functions, and numba itself, are loaded only where something may block light.
+        # Numba is loaded only where something may block light.
         from .triangle_kernels import meet_between
 
         start, end = np.broadcast_arrays(start_mm, end_mm)
         out = np.empty(start.shape[:-1], dtype=bool)
-        lines = (np.ascontiguousarray(points.reshape(-1, 3), dtype=np.float64) for points in (start, end))
-        meet_between(np.array(self.boxes), np.array(self.corners), self.leaf, *lines, _MARGIN_MM, out.reshape(-1))
+        a, b = (np.ascontiguousarray(points.reshape(-1, 3), dtype=np.float64) for points in (start, end))
+        meet_between(np.array(self.boxes), np.array(self.corners), self.leaf, a, b, _MARGIN_MM, out.reshape(-1))
         return out
 
 
 @remembered
 def sharp_edges(body: Body) -> Floats:
-    """Return edges (n, 2, 3) mm of a body for drawings: where it bends, or evenly chosen ones if they are too many."""
-    import trimesh  # its import takes a quarter of a second, and few processes need it
+    """Return edges (n, 2, 3) mm of a body for drawings: where it bends, evenly chosen if they are too many."""
+    import trimesh
 
     mesh = trimesh.Trimesh(body.vertices, body.faces)
     bends = mesh.face_adjacency_edges[mesh.face_adjacency_angles > _SHARP_RAD]

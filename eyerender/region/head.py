@@ -23,7 +23,7 @@ from ..base.arrays import ArrayValue, Floats, Ints, Singles, frozen
 from ..base.errors import InputError, Problems
 from ..base.spec import file_digest
 from ..base.storage.files import opened, shown
-from ..optics.meshfile import read_objects, smooth_normals
+from ..optics.meshfile import read_objects
 from .anatomy import Region
 from .globe import Globe
 from .headspec import Head
@@ -131,7 +131,7 @@ def _loaded(spec: Head, states: tuple[tuple[int, int], ...]) -> HeadMesh:
         for mesh in (m for name in names for m in objects[name]):
             v = np.asarray(mesh.vertices, dtype=float)
             vertices.append(scale * v @ axes.T)
-            normals.append(smooth_normals(vertices[-1], np.asarray(mesh.faces)))
+            normals.append(_smooth(vertices[-1], np.asarray(mesh.faces)))
             faces.append(np.asarray(mesh.faces) + count)
             uv.append(_uv(mesh))
             count += len(v)
@@ -301,6 +301,20 @@ def _check_eye(name: str, eye: Floats, vertices: Floats, problems: Problems) -> 
             f"points backwards: the mesh around {name} lies {-near.mean():.0f} mm behind the globe's centre on average"
         )
         problems.add(reason, "forward")
+
+
+def _smooth(vertices: Floats, faces: Ints) -> Floats:
+    """Compute unit normals of the vertices, equal for vertices at one position, so that texture seams do not show."""
+    import trimesh
+
+    _, first, same = np.unique(np.round(vertices, 6), axis=0, return_index=True, return_inverse=True)
+    same = np.ravel(same)
+    merged = trimesh.Trimesh(vertices[first], same[faces], process=False)
+    normals = np.array(merged.vertex_normals)[same]
+    # A vertex without any area around it has no normal.
+    lost = ~(np.linalg.norm(normals, axis=1) > 0.5)
+    normals[lost] = (1.0, 0.0, 0.0)
+    return normals
 
 
 def _uv(mesh: trimesh.Trimesh) -> Floats:

@@ -79,13 +79,6 @@ class RegionMesh(ArrayValue):
         """Names of the parts."""
         return self.layout.parts
 
-    def faces_of(self, name: str) -> tuple[int, int] | None:
-        """Return the numbers of a part's first triangle and of the first one behind; None if there is no such part."""
-        if name not in self.parts:
-            return None
-        i = self.parts.index(name)
-        return int(self.layout.face_ends[i - 1]) if i else 0, int(self.layout.face_ends[i])
-
     def part(self, name: str) -> trimesh.Trimesh:
         """Return one part as a trimesh: skin, lashes, tears or brow."""
         import trimesh  # its import takes a quarter of a second, and few processes need it

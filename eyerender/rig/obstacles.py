@@ -5,17 +5,21 @@ from __future__ import annotations
 import os
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..base.arrays import OBSTACLE, Body, Floats, frozen
+from ..base.arrays import OBSTACLE, Body, frozen
 from ..base.errors import InputError
 from ..base.spec import Positive, Spec, Vec3
 from ..base.storage.files import opened
-from ..optics.meshfile import read_objects, smooth_normals
+from ..optics.meshfile import read_objects
+from ..optics.transforms import normalize
 from .mount import Mount
+
+if TYPE_CHECKING:
+    import trimesh
 
 _PIECES = 360  # of a ring's circles; their chords are 4e-5 of the radius inside them at most
 _FARTHEST_MM = 1e4
@@ -42,23 +46,15 @@ class ObstacleRing(Spec):
             raise ValueError("inner_radius_mm must be below outer_radius_mm")
         return self
 
-    def surface(self) -> tuple[Floats, Floats, Floats]:
-        """Compute vertices (n, 3) mm, normals (n, 3) and triangles (m, 3) of both walls and both faces."""
-        axis = np.array(self.axis) / np.linalg.norm(self.axis)
-        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-        across /= np.linalg.norm(across)
-        angle = 2.0 * np.pi * np.arange(_PIECES) / _PIECES
-        out = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
-        half, (inner, outer) = 0.5 * self.depth_mm * axis, (self.inner_radius_mm, self.outer_radius_mm)
-        corners = [(inner, half), (outer, half), (outer, -half), (inner, -half)]
-        facing = [np.broadcast_to(axis, out.shape), out, np.broadcast_to(-axis, out.shape), -out]
-        # The circles of all sides, each with the normal of its side.
-        circles = [radius * out + along for k in range(4) for radius, along in (corners[k], corners[(k + 1) % 4])]
-        i, after = np.arange(_PIECES), (np.arange(_PIECES) + 1) % _PIECES
-        halves = [np.stack([i, i + _PIECES, after + _PIECES], 1), np.stack([i, after + _PIECES, after], 1)]
-        faces = np.concatenate([part + 2 * k * _PIECES for k in range(4) for part in halves])
-        normals = np.concatenate([way for way in facing for _ in range(2)])
-        return np.concatenate(circles) + np.array(self.centre_mm), normals, faces
+    def mesh(self) -> trimesh.Trimesh:
+        """Compute the closed mesh of the ring."""
+        import trimesh  # its import takes a quarter of a second, and few processes need it
+
+        radii = self.inner_radius_mm, self.outer_radius_mm
+        ring = trimesh.creation.annulus(*radii, self.depth_mm, sections=_PIECES)
+        ring.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], self.axis))
+        ring.apply_translation(self.centre_mm)
+        return ring
 
 
 class Obstacle(Spec):
@@ -83,44 +79,33 @@ class Obstacle(Spec):
             raise ValueError("give either file or ring")
         return self
 
-    def located(self, base: Path | None) -> Self:
-        """Return the obstacle with its file as an absolute path; it is relative to `base` or the current folder."""
-        if self.file is None:
-            return self
-        return self.model_copy(update={"file": str((Path.cwd() if base is None else base.resolve()) / self.file)})
-
     def build(self, mount: Mount | None = None) -> Body:
         """Build the body, moved by a rig's mount; the same until a file changes.
 
         Raises:
-            InputError: the file cannot be read, or lies 10 m or more away.
+            InputError: the file cannot be read, or reaches 10 m or more away.
         """
         if self.file is None:
             return _built(self, mount, ())
-        try:
-            with opened(Path(self.file)) as stream:
-                state = os.fstat(stream.fileno())
-            return _built(self, mount, (state.st_mtime_ns, state.st_size))
-        except InputError as error:
-            raise error.placed(under="file") from None
+        with opened(Path(self.file)) as stream:
+            state = os.fstat(stream.fileno())
+        return _built(self, mount, (state.st_mtime_ns, state.st_size))
 
 
 @lru_cache(maxsize=32)
 def _built(spec: Obstacle, mount: Mount | None, state: tuple[int, ...]) -> Body:
     del state
-    if spec.ring is not None:
-        vertices, normals, faces = spec.ring.surface()
-    else:
-        meshes = [mesh for _, mesh in read_objects(Path(str(spec.file)))]
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)])
-        vertices = {"mm": 1.0, "cm": 10.0, "m": 1000.0}[spec.unit] * np.concatenate([m.vertices for m in meshes])
-        if np.abs(vertices).max() >= _FARTHEST_MM:
-            reason = f"with unit {spec.unit}, reaches {np.abs(vertices).max():.3g} mm from the world's origin"
-            raise InputError(f"{reason}; at most {_FARTHEST_MM:g} mm", source=str(spec.file))
-        normals = smooth_normals(vertices, faces)
+    meshes = [mesh for _, mesh in read_objects(Path(str(spec.file)))] if spec.ring is None else [spec.ring.mesh()]
+    corners = np.concatenate([np.asarray(mesh.triangles, dtype=float) for mesh in meshes])
+    if spec.ring is None:
+        corners *= {"mm": 1.0, "cm": 10.0, "m": 1000.0}[spec.unit]
+    if (reach := float(np.abs(corners).max())) >= _FARTHEST_MM:
+        reason = f"with unit {spec.unit}, reaches {reach:.3g} mm from the world's origin; at most {_FARTHEST_MM:g} mm"
+        raise InputError(reason, source=spec.file or "")
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = normalize(np.where(np.any(normals, axis=1, keepdims=True), normals, (1.0, 0.0, 0.0)))
     body = Body(
-        part=OBSTACLE, vertices=frozen(vertices), normals=frozen(normals), faces=frozen(faces, np.int64),
-        albedo=spec.albedo,
+        part=OBSTACLE, vertices=frozen(corners.reshape(-1, 3)), normals=frozen(np.repeat(normals, 3, axis=0)),
+        faces=frozen(np.arange(3 * len(corners)).reshape(-1, 3), np.int64), albedo=spec.albedo,
     )  # fmt: skip
     return body if mount is None else mount.body(body)

@@ -148,7 +148,7 @@ class Rig(Spec):
         """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
-        geometry, leds = self.model_copy(update={"mount": None, "obstacles": ()}).build(), []
+        geometry, leds = self.model_copy(update={"mount": None}).build(), []
         for led in self.lights:
             if led.ring is None:
                 leds.append(led.to_mapping())
@@ -179,9 +179,11 @@ class Rig(Spec):
 
     def located(self, base: Path | None = None) -> Self:
         """Return the rig with the files of its obstacles as absolute paths; they are relative to `base`."""
-        if all(obstacle.file is None for obstacle in self.obstacles):
-            return self
-        return self.model_copy(update={"obstacles": tuple(obstacle.located(base) for obstacle in self.obstacles)})
+        folder = Path.cwd() if base is None else base.resolve()
+        placed = tuple(
+            o if o.file is None else o.model_copy(update={"file": str(folder / o.file)}) for o in self.obstacles
+        )
+        return self.model_copy(update={"obstacles": placed}) if placed else self
 
     def build(self) -> RigGeometry:
         """Build the numeric rig."""
@@ -194,7 +196,8 @@ class Rig(Spec):
         if self.mount is not None:
             cameras = tuple(map(self.mount.camera, cameras))
             lights = tuple(map(self.mount.lamp, lights))
-        return RigGeometry(cameras, lights, self.screen.build() if self.screen else None, self.obstacles, self.mount)
+        screen, moved_by = self.screen.build() if self.screen else None, self.mount if self.obstacles else None
+        return RigGeometry(cameras, lights, screen, self.obstacles, moved_by)
 
 
 class RigLike(Protocol):
@@ -210,9 +213,9 @@ class RigLike(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry(ArrayValue):
-    """Cameras, lights, the screen, if there is one, and obstacles, which `to_mapping` leaves out.
+    """Cameras, lights, the screen, if there is one, and obstacles as authored, before a mount moves them.
 
-    Obstacles are as authored, before the mount moves them: files are read where their bodies are needed.
+    `to_mapping` leaves obstacles out. Their files are read where their bodies are needed.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -236,7 +239,7 @@ class RigGeometry(ArrayValue):
             try:
                 out.append(obstacle.build(self.mount))
             except InputError as error:
-                raise error.placed(under=f"rig.obstacles.{k}") from None
+                raise error.placed(under=f"rig.obstacles.{k}.file") from None
         return tuple(out)
 
     def lights_of(self, eye: int) -> tuple[int, ...]:

@@ -159,7 +159,7 @@ def hidden_at(openings: Sequence[Opening], camera: PinholeCamera, points_px: Flo
     x = camera.resolution_px[0] - 1 - x if camera.flip else x
     through = np.ones(x.shape)
     for opening in openings:
-        through = through * _transmission_at(opening, tuple(camera.resolution_px), x, y)
+        through = through * _transmission_at(opening, camera.resolution_px, x, y)
     return np.asarray(through < 0.5)
 
 

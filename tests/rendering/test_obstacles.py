@@ -1,4 +1,4 @@
-"""Obstacles of a rig and openings of a lens in pictures: against the stock path integrator, and features against labels."""
+"""Obstacles and openings in pictures: against the stock path integrator, and features against labels."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_meshes_of_files_block_as_they_stand_in_the_world(kind, tmp_path):
     body = Obstacle.from_mapping({"ring": RING}).build()
     factor = {"mm": 1.0, "m": 1e-3}[unit := "m" if kind == "glb" else "mm"]
     trimesh.Trimesh(factor * body.vertices, body.faces).export(tmp_path / f"ring.{kind}")
-    read = Obstacle(file=f"ring.{kind}", unit=unit).located(tmp_path).build()
+    read = Obstacle(file=str(tmp_path / f"ring.{kind}"), unit=unit).build()
     rng = np.random.default_rng(4)
     start, end = (rng.normal(size=(4_000, 3)) * 9 + RING["centre_mm"] for _ in range(2))
     same = TriangleTree.of([read]).blocks(start, end) == TriangleTree.of([body]).blocks(start, end)
@@ -122,7 +122,7 @@ def test_files_that_cannot_be_obstacles_end_with_one_line(tmp_path):
 
 
 def test_a_ring_has_a_rectangular_section():
-    vertices, _, _ = ObstacleRing(**RING).surface()
+    vertices = ObstacleRing(**RING).mesh().vertices
     axis = np.array(RING["axis"]) / np.linalg.norm(RING["axis"])
     along = (vertices - RING["centre_mm"]) @ axis
     away = np.linalg.norm(vertices - RING["centre_mm"] - along[:, None] * axis, axis=1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -203,24 +203,8 @@ def _corners(distance_mm: float) -> Floats:
     return np.array([[-distance_mm, y, z] for y, z in ((-h, -h), (h, -h), (h, h), (-h, h))])
 
 
-class Surroundings(Protocol):
-    """What may block light around an eye: triangles of parts in order."""
-
-    scene: mi.Scene
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Names of the parts."""
-        ...
-
-    @property
-    def face_ends(self) -> Ints:
-        """End of each part's triangles."""
-        ...
-
-
-def blockers(place: Surroundings, a: Floats, b: Floats) -> list[str | None]:
-    """Return the first part between points (n, 3) a and b of the scene's frame; None if there is none."""
+def blockers(place: Any, a: Floats, b: Floats) -> list[str | None]:
+    """Return the first part of a background or region between points (n, 3) a and b; None if there is none."""
     hit = place.scene.ray_intersect_preliminary(rays_between(a, b), coherent=False, active=True)
     valid, face = hit.is_valid(), mi.UInt32(hit.prim_index)
     dr.eval(valid, face)

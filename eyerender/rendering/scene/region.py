@@ -95,8 +95,10 @@ class RegionScene:
 
     def _range(self, name: str) -> tuple[mi.UInt32, mi.UInt32] | None:
         """Return the triangles of a part on the device, from the first one to the first one behind."""
-        ends = self.posed.faces_of(name)
-        return None if ends is None else (dr.opaque(mi.UInt32, ends[0]), dr.opaque(mi.UInt32, ends[1]))
+        if name not in self.parts:
+            return None
+        last = self.parts.index(name)
+        return dr.opaque(mi.UInt32, int(self.face_ends[last - 1])), dr.opaque(mi.UInt32, int(self.face_ends[last]))
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -110,9 +112,8 @@ class RegionScene:
 
     def takes(self, spec: Region, globe: Globe) -> bool:
         """Return whether a subject fits the meshes of the scene."""
-        layout, bodies = self.posed.layout, globe.frames
-        vertices = int(layout.vertex_ends[-2] - layout.vertex_ends[HAIRS])
-        fits = (vertices, self.body_faces) == (sum(len(b.vertices) for b in bodies), sum(len(b.faces) for b in bodies))
+        ends, own = self.posed.layout.vertex_ends, [(len(b.vertices), len(b.faces)) for b in globe.frames]
+        fits = np.array_equal([ends[-2] - ends[HAIRS], self.body_faces], np.sum([(0, 0), *own], axis=0))
         return not self.fixed and spec.head is None and fits
 
     @property
