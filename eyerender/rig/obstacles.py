@@ -51,7 +51,7 @@ class ObstacleRing(Spec):
         import trimesh  # its import takes a quarter of a second, and few processes need it
 
         radii = self.inner_radius_mm, self.outer_radius_mm
-        ring = trimesh.creation.annulus(*radii, self.depth_mm, sections=_PIECES)
+        ring: trimesh.Trimesh = trimesh.creation.annulus(*radii, self.depth_mm, sections=_PIECES)
         ring.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], self.axis))
         ring.apply_translation(self.centre_mm)
         return ring
