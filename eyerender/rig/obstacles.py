@@ -52,8 +52,10 @@ class ObstacleRing(Spec):
 
         radii = self.inner_radius_mm, self.outer_radius_mm
         ring: trimesh.Trimesh = trimesh.creation.annulus(*radii, self.depth_mm, sections=_PIECES)
-        ring.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], self.axis))
-        ring.apply_translation(self.centre_mm)
+        axis = normalize(np.array(self.axis, dtype=float))
+        across = normalize(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
+        pose = np.column_stack([across, np.cross(axis, across), axis, self.centre_mm])
+        ring.apply_transform(np.vstack([pose, [0.0, 0.0, 0.0, 1.0]]))
         return ring
 
 
