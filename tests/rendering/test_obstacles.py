@@ -192,6 +192,6 @@ def test_shadow_and_edge_of_an_obstacle_against_path(renderer, tmp_path, region)
 def test_obstacles_of_yaml_and_python_are_one():
     data = tree()
     part = er.rig.Obstacle(ring=er.rig.ObstacleRing(**ring()["ring"]), albedo=0.3)
-    rig = er.Rig(cameras=data["rig"]["cameras"], lights=data["rig"]["lights"], obstacles=[part])
+    rig = er.Rig(cameras=data["rig"]["cameras"], lights=data["rig"]["lights"], obstacles=(part,))
     assert rig.build() == obstructed().rig
     assert er.Rig.from_mapping(rig.to_mapping()) == rig

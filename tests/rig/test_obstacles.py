@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
@@ -12,9 +14,15 @@ from eyerender.optics.triangles import TriangleTree
 from eyerender.rig.mount import Mount
 from eyerender.rig.obstacles import Obstacle, ObstacleRing
 
-RING = {"centre_mm": [16, -31.5, 2], "axis": [2, 0.5, -0.3], "inner_radius_mm": 5, "outer_radius_mm": 9, "depth_mm": 4}
+RING: dict[str, Any] = {
+    "centre_mm": [16, -31.5, 2],
+    "axis": [2, 0.5, -0.3],
+    "inner_radius_mm": 5,
+    "outer_radius_mm": 9,
+    "depth_mm": 4,
+}
 CAMERA = {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 3000, "resolution_px": [640, 480]}
-RIG = {"cameras": [CAMERA], "lights": [{"position_mm": [600, 120, 0]}]}
+RIG: dict[str, Any] = {"cameras": [CAMERA], "lights": [{"position_mm": [600, 120, 0]}]}
 
 
 def in_ring(start, end, shrunk_mm):
@@ -68,7 +76,7 @@ def test_meshes_of_files_block_as_they_stand_in_the_world(kind, tmp_path):
     body = Obstacle.from_mapping({"ring": RING}).build()
     factor = {"mm": 1.0, "m": 1e-3}[unit := "m" if kind == "glb" else "mm"]
     trimesh.Trimesh(factor * body.vertices, body.faces).export(tmp_path / f"ring.{kind}")
-    read = Obstacle(file=str(tmp_path / f"ring.{kind}"), unit=unit).build()
+    read = Obstacle.from_mapping({"file": str(tmp_path / f"ring.{kind}"), "unit": unit}).build()
     rng = np.random.default_rng(4)
     start, end = (rng.normal(size=(4_000, 3)) * 9 + RING["centre_mm"] for _ in range(2))
     same = TriangleTree.of([read]).blocks(start, end) == TriangleTree.of([body]).blocks(start, end)
