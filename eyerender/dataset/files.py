@@ -1,4 +1,4 @@
-"""Files that a dataset's spec names (HDR maps, head meshes, calibrations, eye files), and their checksums.
+"""Files that a dataset's spec names (HDR maps, head meshes, obstacles, calibrations, eye files), and their checksums.
 
 Their content affects the images, so their checksums, by the names in the spec, are part of a run's identity. `Plan.of`
 adds the eye files, which it reads itself.

@@ -80,6 +80,7 @@ def spec_in(place: Path, **more) -> Path:
             {"ambient": {"map": {"draw": "fixed", "value": {"file": {"draw": "grid", "values": ["rooms/day.npy"]}}}}},
             {"rooms/day.npy"},
         ),
+        ({"rig": {"obstacles": [{"file": "heads/bar.ply"}, {"ring": {}}]}}, {"heads/bar.ply"}),
         ({"region": {"head": {"file": "heads/bar.json"}}}, {"heads/bar.json", "heads/bar.ply"}),
         ({"region": {"head": {**HEAD, "file": ["heads/bar.ply"]}}}, {"heads/bar.ply"}),
         (
