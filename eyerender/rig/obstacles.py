@@ -13,7 +13,6 @@ from pydantic import Field, model_validator
 from ..base.arrays import OBSTACLE, Body, frozen
 from ..base.errors import InputError
 from ..base.spec import Positive, Spec, Vec3
-from ..base.storage.files import opened
 from ..optics.meshfile import read_objects
 from ..optics.transforms import normalize
 from .mount import Mount
@@ -87,10 +86,9 @@ class Obstacle(Spec):
         Raises:
             InputError: the file cannot be read, or reaches 10 m or more away.
         """
-        if self.file is None:
+        if self.file is None or not os.path.isfile(self.file):  # then reading it says why
             return _built(self, mount, ())
-        with opened(Path(self.file)) as stream:
-            state = os.fstat(stream.fileno())
+        state = os.stat(self.file)
         return _built(self, mount, (state.st_mtime_ns, state.st_size))
 
 

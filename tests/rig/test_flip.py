@@ -27,6 +27,8 @@ def scene(path, **camera):
     data = er.load_scene("headset").spec.to_mapping()
     own = data["rig"]["cameras"][0]
     data["rig"]["cameras"][0] = {**own, "focal_length_px": 300, "principal_point_px": [300, 250], **camera}
+    if "mirror" in camera:
+        del data["rig"]["obstacles"]
     data["image"] = {"spp": 2, "window_px": [160, 120]}
     data["targets"] = {"screen_mm": data["targets"]["screen_mm"][:2]}
     # What belongs to the sensor's pixels is turned with them.

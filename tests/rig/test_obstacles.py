@@ -119,7 +119,7 @@ def test_files_that_cannot_be_obstacles_end_with_one_line(tmp_path):
     box.export(tmp_path / "far.stl")
     (tmp_path / "bad.stl").write_bytes(b"solid nothing")
     for file, unit, words in (("none.stl", "mm", "no such file"), ("bad.stl", "mm", "is not a readable mesh|holds no"),
-                              ("far.stl", "m", "with unit m, reaches"), ("a.txt", "mm", "no such file")):  # fmt: skip
+                              ("far.stl", "m", "with unit m, reaches"), ("a.txt", "mm", "must end with")):  # fmt: skip
         rig = er.Rig.from_mapping({**RIG, "obstacles": [{"file": file, "unit": unit}]}).located(tmp_path)
         with pytest.raises(InputError, match=words) as error:
             rig.build().bodies()
