@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -166,6 +167,8 @@ class FolderDataset(Dataset[Any]):
                 raise InputError(f"no image is of the split {split!r}; there are {found}", source=str(path))
         if group not in (None, "sample"):
             raise InputError(f"must be 'sample', not {group!r}", path="group")
+        # Pictures are found without reading the labels.
+        self.entries = replace(self.folder.entries, brief=not self.preparation.reads_labels)
         self.groups = None if group is None else _groups(self.folder.samples()[self.rows], self.rows)
 
     def __len__(self) -> int:
@@ -181,7 +184,7 @@ class FolderDataset(Dataset[Any]):
         return item if self.transform is None else self.transform(item)
 
     def _image(self, row: int, key: Sequence[int]) -> dict[str, Any]:
-        entry = self.folder.entries[row]
+        entry = self.entries[row]
         where = f"{entry.source}: line {entry.number}"
         item = self.preparation.read(entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
         return _tensors(self.preparation.finish(item, key), self.preparation, entry.line)

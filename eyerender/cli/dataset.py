@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -12,6 +12,9 @@ from ..dataset.options import PlanOptions, RunOptions
 from .app import app
 from .options import AtLeastOne, Backend, EyeModel, OutputFile, OutputFolder, Overwrite, Result, Seed, Strict, Threads
 from .output import Heed, emit, progress, say
+
+if TYPE_CHECKING:
+    from ..dataset.plan import Plan
 
 
 @app.command(name="generate")
@@ -36,7 +39,7 @@ def generate(
 
     Started again on the same folder, the command makes only what is missing. Ctrl-C or SIGTERM (`kill PID`) stops it
     and keeps what is finished. For a command in the background of a shell script, use SIGTERM: the shell makes it
-    ignore Ctrl-C.
+    ignore Ctrl-C. If more than 2 % of the samples could not be made, the exit code is 1.
 
     Args:
         spec: A dataset file, the name of a shipped one, or MODULE:FUNCTION, which gives the scene of (seed, i).
@@ -68,12 +71,14 @@ def generate(
         found = estimate(plan, options, measure=measure, warn=heed)
         emit(found, _estimate_text(found), json, heed)
         return 0
+    from ..dataset.run import GIVEN_UP_SHARE
     from ..dataset.run import generate as run
 
     with progress("generating") as steps:
         done = run(plan, output, options, part=part, progress=steps, say=say, warn=heed)
-    emit(done, _generate_text(done), json, heed)
-    return 0
+    emit(done, "\n".join([*_generate_lines(done), *_shard_lines(plan)]), json, heed)
+    found = done.get("statistics", {"samples_given_up": 0})
+    return EyerenderError.exit_code if found["samples_given_up"] > GIVEN_UP_SHARE * plan.spec.count else 0
 
 
 @app.command(name="sample")
@@ -123,6 +128,7 @@ def preview(
     seed: Seed = None,
     backend: Backend = "auto",
     threads: Threads = None,
+    planned: bool = False,
     strict: Strict = False,
 ) -> int:
     """Render a contact sheet of 16 images of a scene or a dataset.
@@ -132,12 +138,14 @@ def preview(
     Args:
         spec: A scene or dataset file, or the name of a shipped one.
         output: The picture to write.
+        planned: Draw the outlines of pupil, iris and lids and the glints of a dataset's samples, without rendering.
     """
     from ..dataset.sheet import preview as render
 
     heed = Heed(strict)
-    with progress("rendering") as steps:
-        render(spec, output, eye=eye, seed=seed, backend=backend, threads=threads, progress=steps, warn=heed)
+    how: dict[str, Any] = {"backend": backend, "threads": threads, "planned": planned}
+    with progress("drawing" if planned else "rendering") as steps:
+        render(spec, output, eye=eye, seed=seed, progress=steps, warn=heed, **how)
     print(output)
     return 0
 
@@ -291,18 +299,31 @@ def part_of(text: str | None) -> tuple[int, int]:
     return int(k), int(n)
 
 
-def _generate_text(done: dict[str, Any]) -> str:
+def _shard_lines(plan: Plan) -> list[str]:
+    """Say how full the shards are where fewer samples than those of the plan are made."""
+    spec, shards = plan.spec, len(plan.spec.shards)
+    if spec.count >= spec.planned_count or shards < 2 or spec.count / shards >= spec.shard_size / 2:
+        return []
+    return [
+        f"the {shards} shards hold {spec.count / shards:.1f} samples on average and have gaps in their numbers: "
+        f"a shard has room for {spec.shard_size} of the plan's {spec.planned_count} samples"
+    ]
+
+
+def _generate_lines(done: dict[str, Any]) -> list[str]:
     lines = [f"{done['images_made']} images made in {done['seconds']:.1f} s ({done['shards_made']} shards)"]
     if not done["complete"]:
         lines.append(f"{done['shards_missing']} shards are still missing")
-        return "\n".join(lines)
+        return lines
     s = done["statistics"]
     splits = ", ".join(f"{name} {n}" for name, n in s["images_by_split"].items())
     lines.append(f"{s['images']} images in {done['path']}: {splits}; {s['bytes_per_image']} bytes per image")
     if s["attempts_rejected"]:
         given = s["samples_given_up"]
         lines.append(f"{s['attempts_rejected']} attempts redrawn, {given} samples given up (see failures.jsonl)")
-    return "\n".join(lines)
+    if done["splits_empty"]:
+        lines.append(f"no image is in {', '.join(done['splits_empty'])}: more subjects are needed for all splits")
+    return lines
 
 
 def _estimate_text(found: dict[str, Any]) -> str:

@@ -33,9 +33,9 @@ def inspect(
     Args:
         folder: A folder written by generate, or by render; with --planned a dataset spec.
         other: A second one, to compare with.
-        output: An HTML page to write, with pictures.
+        output: An HTML page to write: contents, faults, shares, dependences, the worst pictures, distributions.
         images: The largest number of images that are read of a dataset, spread evenly over it.
-        planned: Draw the samples of a spec instead of reading a folder, and say which draws depend on each other.
+        planned: Draw the samples of a spec instead of reading a folder: splits, distributions and dependences of draws.
         workers: Number of processes that read them (default: all processors).
     """
     from ..apps.inspection import inspect as look

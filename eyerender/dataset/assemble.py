@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from ..folders.packed import INDEX, TAR
 from .card import data_card
 from .croissant import CROISSANT, croissant
 from .done import FILES, PACKED, checksum, compare_sums, is_sums, layout_of, read_done, run_versions, sum_of
+from .lines import drop_lines
 from .packing import counts_of
 from .plan import Plan
 from .shard import verify
@@ -47,7 +48,7 @@ _SHOWN = 50  # missing shards that are named
 def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     """Assemble the dataset from verified shards and return its statistics.
 
-    The same shards give the same bytes.
+    The same shards give the same bytes. Shards of files then lose their own files of lines, which metadata.jsonl holds.
 
     Raises:
         EyerenderError: no sample could be made, or the disk is full or not writable.
@@ -61,6 +62,7 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         for shard in plan.spec.shards:
             done = read_done(folder, shard)
             statistics.take_shard(done)
+            statistics.lost |= {plan.spec.selection.subject_of(sample) for sample in done["given_up"]}
             table.take(shard, done)
             file.writelines((json.dumps(rejection) + "\n").encode() for rejection in done["rejections"])
     if not statistics.images:
@@ -87,6 +89,8 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         "checksums": {name: sum_of(folder / name) for name in (table.layout.table, FAILURES)},
     }
     write_json(folder / DATASET, dataset)
+    if not plan.spec.is_packed:
+        drop_lines(folder, plan.spec.shards)
     return found
 
 
@@ -218,19 +222,22 @@ def type_first(lines: Callable[[], Iterable[str]], take: Callable[[dict[str, Any
 
     Loaders determine a column's type from the first lines of the file (Hugging Face from its first 10 MB). A column
     that is null there gets no type, and loading fails at the first value, such as a reason that occurs once in ten
-    thousand images. So the first line that fills a column comes to the front; all others keep their order.
+    thousand images. So the first line that fills a column comes to the front, with all lines of its sample; others
+    keep their order.
 
     `lines` is called twice; `take` is called once with each parsed line.
     """
     seen: set[str] = set()
     first: dict[int, str] = {}
-    for number, text in enumerate(lines()):
-        line = json.loads(text)
-        take(line)
-        filled = set(_filled(line, ""))
+    read = ((number, text, json.loads(text)) for number, text in enumerate(lines()))
+    for _, group in groupby(read, key=lambda one: one[2]["sample"]):
+        own = list(group)
+        for _, _, line in own:
+            take(line)
+        filled = {path for _, _, line in own for path in _filled(line, "")}
         if not filled <= seen:
             seen |= filled
-            first[number] = text
+            first |= {number: text for number, text, _ in own}
     yield from first.values()
     for number, text in enumerate(lines()):
         if number not in first:
@@ -259,6 +266,7 @@ class Statistics:
         self.tars: dict[str, str] = {}  # SHA-256 of packed shards, by name
         self.splits: Counter[str] = Counter()
         self.subjects: dict[str, set[int]] = {}
+        self.lost: set[int] = set()  # subjects with samples that were given up
         self.pupil_px: list[float] = []
         self.visible = 0
         self.glints = 0
@@ -276,7 +284,8 @@ class Statistics:
         self.given_up += len(done["given_up"])
         # Of done.json, what grows with the images, which is the same on every machine, and about 1 kB more.
         record = 1000 + len(json.dumps([done["files"], done.get("columns"), done.get("chosen")]))
-        self.bytes += sum(entry["bytes"] for entry in done["files"].values()) + record
+        # The lines of shards of files are in metadata.jsonl.
+        self.bytes += record + sum(e["bytes"] for name, e in done["files"].items() if not name.endswith(f"/{LINES}"))
         self.tars |= {name: entry["sha256"] for name, entry in done["files"].items() if name.endswith(TAR)}
 
     def take_line(self, line: dict[str, Any]) -> None:
@@ -306,4 +315,5 @@ class Statistics:
             "pupil_semi_axis_px": [sizes[0], sizes[len(sizes) // 2], sizes[-1]] if sizes else None,
             "attempts_rejected": self.rejected,
             "samples_given_up": self.given_up,
+            "subjects_left_out": len(self.lost.difference(*self.subjects.values())),
         }

@@ -274,8 +274,7 @@ def _timed(maker: Maker, samples: Iterable[int]) -> list[_Timed]:
         pictures = [picture for image in made.images for picture in image.pictures.values()]
         size = sum(len(picture_bytes(picture)) + (_MEMBER if is_packed else _ENTRY) for picture in pictures)
         lines += (image.line for image in made.images)
-        # Metadata of files is stored in the shards and in the assembled file.
-        size += 0 if is_packed else 2 * sum(len(json.dumps(image.line)) for image in made.images)
+        size += 0 if is_packed else sum(len(json.dumps(image.line)) for image in made.images)
         began, last = time.perf_counter(), began
         found.append(_Timed(began - last, len(made.images), size))
     more = len(pack_lines(lines)[0]) / len(found) if is_packed and lines else 0.0

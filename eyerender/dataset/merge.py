@@ -11,9 +11,10 @@ from ..base.errors import WRONG, EyerenderError, InputError
 from ..base.progress import Progress
 from ..base.storage.files import inside, make_folder, opened, sync_folder, sync_tree, write_json
 from ..base.storage.lock import final_lock, run_lock
-from ..folders.imagefolder import DONE, RUN, SHARDS, finished, read_run
+from ..folders.imagefolder import DATASET, DONE, RUN, SHARDS, finished, read_run
 from .assemble import assemble
 from .done import checksum, read_done
+from .lines import ShardLines, lines_file, restore_lines
 from .packing import SHARD
 from .partial import new_stage
 from .plan import Plan
@@ -63,6 +64,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | 
         make_folder(folder)
         with run_lock(folder, (1, 1), lambda _: None), final_lock(folder, lambda _: None):
             begin(folder, plan, lambda _: None)
+            restore_lines(folder)
             _take(folder, places, plan, step)
             missing = set(plan.spec.shards) - finished(folder)
             statistics = None if missing else assemble(plan, folder)
@@ -79,26 +81,31 @@ def _take(folder: Path, places: Sequence[Path], plan: Plan, step: Progress) -> N
     """Copy every shard that the folder lacks from the first part that has it."""
     wanted, there = set(plan.spec.shards), finished(folder)
     sources = {shard: place for place in reversed(places) for shard in finished(place) & wanted - there}
+    lines = {place: ShardLines.index(place) for place in set(sources.values()) if (place / DATASET).is_file()}
     for k, (shard, place) in enumerate(sorted(sources.items())):
         problem = next(verify(place, shard, plan.digest, quick=True), None)
         if problem is not None:
             raise InputError(f"{problem}; {_REPAIR}", source=str(place))
-        commit(folder, _staged(folder, place, shard))
+        commit(folder, _staged(folder, place, shard, lines.get(place)))
         step(k + 1, len(sources), "shards")
 
 
-def _staged(folder: Path, place: Path, shard: int) -> Staged:
-    """Copy a verified shard into a temporary folder, for `commit` to put in place."""
+def _staged(folder: Path, place: Path, shard: int, lines: ShardLines | None) -> Staged:
+    """Copy a verified shard into a temporary folder, for `commit` to put in place; `lines` are a finished dataset's."""
     stage, done = new_stage(folder, shard), read_done(place, shard)
     for name in done["files"]:
         if name.count("/") != 2:
             raise InputError("does not lie in a folder of the shard", source=str(place / name))
     for name, entry in done["files"].items():
         kind, _, file = name.split("/", 2)
-        source, own = inside(place, name), stage / (SHARD if kind == SHARDS else kind) / file
+        source, own = place / name, stage / (SHARD if kind == SHARDS else kind) / file
         make_folder(own.parent)
-        with opened(source, follow=False) as read, open(own, "xb") as write:
-            shutil.copyfileobj(read, write)
+        with open(own, "xb") as write:
+            if source == lines_file(place, shard) and lines is not None and not source.exists():
+                write.writelines(lines.of(shard))
+            else:
+                with opened(inside(place, name), follow=False) as read:
+                    shutil.copyfileobj(read, write)
         if checksum(own) != entry["sha256"]:
             raise InputError(f"differs from its checksum in {DONE}; {_REPAIR}", source=str(source))
     write_json(stage / DONE, done)

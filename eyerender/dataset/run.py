@@ -5,23 +5,24 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..base.errors import EyerenderError, InputError, Warn
+from ..base.errors import EyerenderError, InputError, InputWarning, Warn
 from ..base.progress import Progress, Say
 from ..base.storage.files import MAX_FILE_BYTES, make_folder, read_json, remove_file
 from ..base.storage.lock import LOCK, final_lock, run_lock
 from ..folders.imagefolder import DATASET, finished
 from ..folders.outfolder import clear, refuse_non_empty
 from ..rig.plausibility import saturation_warnings
-from .assemble import assemble, damage
+from .assemble import FAILURES, assemble, damage
 from .done import cpu_family, read_done
 from .environment import environment
 from .estimate import Speed, keep_rate
+from .lines import restore_lines
 from .options import RunOptions
 from .partial import checkpoints, set_aside
 from .plan import Plan
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from .cluster import RayEngine
 
 LOG_S = 60.0  # the log is written at least so often while samples are made
+GIVEN_UP_SHARE = 0.02
+"""Share of samples that cannot be made above which the command says that the run failed."""
 
 
 def generate(
@@ -103,6 +106,7 @@ def generate(
     if warn is not None:
         statistics = done.get("statistics", {})
         warn(saturation_warnings(statistics.get("images_saturated", 0), statistics.get("images", 0), str(path)))
+        warn(_given_up_warnings(statistics, str(path)))
     return done
 
 
@@ -149,6 +153,7 @@ def opened_run(
             )
             with final_lock(folder, say):
                 resumed = begin(folder, plan, run.repaired)
+                restore_lines(folder)
             try:
                 yield run, resumed
             except InputError:
@@ -277,8 +282,13 @@ class Run:
         }
         self.log.write("end", **(statistics or {}))
         if statistics is not None:
-            summary |= {"statistics": statistics}
+            summary |= {"statistics": statistics, "splits_empty": self._empty_splits(statistics)}
         return summary
+
+    def _empty_splits(self, statistics: Mapping[str, Any]) -> list[str]:
+        """Return the splits that should have images and have none."""
+        shares = self.plan.spec.splits
+        return [name for name, share in shares.items() if share > 0 and name not in statistics["images_by_split"]]
 
     def mine(self) -> set[int]:
         """Shards of this part."""
@@ -309,6 +319,7 @@ class Run:
             found: dict[str, Any] = read_json(self.folder / DATASET, limit=MAX_FILE_BYTES, follow=False)["statistics"]
             return missing, found
         with final_lock(self.folder, self.say):
+            restore_lines(self.folder)  # another part may have assembled the dataset in the meantime
             if self._verifies:
                 # These are the shards of other parts; this run has verified or made its own ones.
                 self._withdraw(set(self.plan.spec.shards) - self.verified)
@@ -468,6 +479,18 @@ class Run:
             )
             self.log.write("warning", reason="mixed backends or processors", backend=backend)
         self.makers.add(key)
+
+
+def _given_up_warnings(statistics: Mapping[str, Any], source: str) -> list[InputWarning]:
+    """Warn of samples that are lacking, because those of some people may lack more often than those of others."""
+    lost = statistics.get("samples_given_up", 0)
+    if not lost:
+        return []
+    reason = (
+        f"{lost} of {statistics['samples']} samples could not be made, and {statistics.get('subjects_left_out', 0)} "
+        f"subjects have no image, so the dataset may be biased ({FAILURES} has the reasons)"
+    )
+    return [InputWarning(code="given-up", reason=reason, source=source)]
 
 
 def _clock(seconds: float) -> str:

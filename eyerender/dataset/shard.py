@@ -1,6 +1,6 @@
 """Shards, which are written to a temporary folder and renamed when complete.
 
-    images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl, done.json
+    images/00003/*.png   masks/00003/*.png   shards/00003/lines.jsonl (`lines.py`), done.json
 
 `done.json` is put in place last, after all other files are in place and synced. A shard with this file is therefore
 complete, even after a power cut, and its checksums show later damage. Checkpoints of partial shards also remain when a
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from ..base.errors import InputError
 from ..base.storage.files import PART, exchange_folders, link_or_copy, make_folder, remove_file, sync_folder
-from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, shard_name
+from ..folders.imagefolder import DATASET, DONE, KINDS, LINES, METADATA, SHARDS, shard_name
 from .done import FILES, PACKED, compare_sums, described, read_done, read_done_file
 from .maker import Maker
 from .partial import PartialShard, places, remove_stages, samples_in, set_aside, take_back
@@ -39,7 +39,7 @@ class Staged:
     rejected: int
     given_up: int
     seconds: float
-    bytes: int  # final size on disk; metadata is stored in the shard and in the assembled file
+    bytes: int  # size on disk
 
 
 def write_shard(
@@ -89,8 +89,7 @@ def staged(partial: PartialShard) -> Staged:
         rejected=len(done["rejections"]),
         given_up=len(done["given_up"]),
         seconds=partial.seconds,
-        bytes=sum(entry["bytes"] * (1 + name.endswith(LINES)) for name, entry in done["files"].items())
-        + len(json.dumps(done)),
+        bytes=sum(entry["bytes"] for entry in done["files"].values()) + len(json.dumps(done)),
     )
 
 
@@ -195,10 +194,16 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
         return
     layout = PACKED if done["schema"] == PACKED.shard else FILES
     own = tuple(f"{kind}/{name}/" for kind in (*layout.kinds, SHARDS))
-    if f"{SHARDS}/{name}/{layout.lines}" not in done["files"] or not all(n.startswith(own) for n in done["files"]):
+    lines = f"{SHARDS}/{name}/{layout.lines}"
+    if lines not in done["files"] or not all(n.startswith(own) for n in done["files"]):
         yield f"{SHARDS}/{name}/{DONE}: files: do not belong to this shard"
         return
-    yield from compare_sums(folder, done["files"], quick=quick)
+    # In a finished dataset, metadata.jsonl holds the lines of shards of files, with its own checksum.
+    is_whole = (folder / DATASET).is_file() and (folder / METADATA).is_file()
+    is_dropped = is_whole and layout is FILES and not os.path.lexists(folder / lines)
+    yield from compare_sums(
+        folder, {n: e for n, e in done["files"].items() if n != lines or not is_dropped}, quick=quick
+    )
 
 
 def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[int, str]:

@@ -1,4 +1,4 @@
-"""A contact sheet of sixteen images, from a dataset spec's samples or a scene's windows."""
+"""A contact sheet of sixteen images, from a dataset spec's samples or a scene's windows; or their outlines alone."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from ..backends.choose import BackendChoice
-from ..base.arrays import Bytes
+from ..base.arrays import Bytes, Floats
 from ..base.errors import InputError, Warn
 from ..base.progress import Progress, notify
 from ..base.storage.files import written
 from ..folders.imagefile import preview as eight_bit
 from ..imaging.capture import make_renderer, render_windows
+from ..imaging.labels import EyeInWindow, known_labels
+from ..optics.ellipse import points_on_ellipse
 from ..rig.plausibility import is_saturated, saturation_warnings
-from ..scene import Scene, is_dataset, load_scene, refuse_folder, shipped_files
+from ..scene import Frames, Scene, is_dataset, load_scene, refuse_folder, shipped_files
+from ..scene.observation import Observations
 from .maker import Maker
 from .plan import Plan, is_function
-from .realise import frames_of
+from .realise import frames_of, realise
 from .spec import DatasetSpec, shipped_datasets
+from .validation.truth import lid_landmarks
 
 TILES = 16
 _COLUMNS, _WIDTH, _GAP = 4, 320, 4
@@ -37,6 +41,7 @@ def preview(
     seed: int | None = None,
     backend: BackendChoice = "auto",
     threads: int | None = None,
+    planned: bool = False,
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> int:
@@ -51,6 +56,7 @@ def preview(
         seed: replaces the seed of a file.
         backend: the render backend.
         threads: total number of processor threads; by default all.
+        planned: draw the outlines of pupil, iris and lids and the glints of a dataset's samples instead of rendering.
         progress: called with (images done, images in all, "images").
         warn: called with warnings about the scene or spec before anything is rendered, and about saturated images
             before the file is written; if it raises, nothing is written.
@@ -59,7 +65,8 @@ def preview(
         The number of images on the sheet.
 
     Raises:
-        InputError: the suffix is not that of an image format, or no sample of the spec can be made.
+        InputError: the suffix is not that of an image format, a sample of the spec cannot be made, or `planned` is
+            given with a scene.
         EyerenderError: the file cannot be written.
     """
     path = Path(path)
@@ -68,7 +75,12 @@ def preview(
     what = _found(given, eye, seed)
     if warn is not None:
         warn(what.warnings())
-    maker = _of_plan(what, backend, threads) if isinstance(what, Plan) else _of_scene(what, backend, threads)
+    if planned and not isinstance(what, Plan):
+        raise InputError("takes a dataset spec, not a scene", source="--planned")
+    if isinstance(what, Plan):
+        maker = _planned(what) if planned else _of_plan(what, backend, threads)
+    else:
+        maker = _of_scene(what, backend, threads)
     tiles: list[Tile] = []
     saturated = 0
     for total, tile, is_white in maker:
@@ -125,6 +137,41 @@ def _of_plan(plan: Plan, backend: BackendChoice, threads: int | None) -> Iterato
         image = made.images[0]
         caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
         yield len(chosen), _tile(image.pictures["images"], image.line, caption), image.saturated
+
+
+def _planned(plan: Plan) -> Iterator[tuple[int, Tile, bool]]:
+    frames, chosen = frames_of(plan), plan.spread(TILES)
+    for index in chosen:
+        found = realise(plan, index, frames)
+        if found.sample is None or found.frames is None or found.observations is None:
+            raise InputError(f"sample {index} cannot be made: {found.rejections[-1].reason}", source=plan.source)
+        caption = f"{found.sample.split} sample {index} subject {found.sample.turn.subject}"
+        yield len(chosen), (outlines(found.frames, found.observations), caption), False
+
+
+def outlines(frames: Frames, observations: Observations) -> Bytes:
+    """Draw what the first row of frames will show: outlines of pupil, iris and lids, and glints; black on white."""
+    view = EyeInWindow.of(frames, 0)
+    x0, y0, width, height = view.window
+    labels, lids = known_labels(frames.scene, observations, view), lid_landmarks(frames.scene, view)
+    picture = Image.new("L", (width, height), 255)
+    pen, stroke = ImageDraw.Draw(picture), max(1, width // 160)
+
+    def line(points: Floats, *, closed: bool) -> None:
+        places = [(float(x - x0), float(y - y0)) for x, y in points]
+        pen.line(places + places[:1] if closed else places, fill=0, width=stroke)
+
+    for part in ("iris", "pupil"):
+        amodal = labels[part]["amodal"]
+        if amodal["centre_px"] is not None:
+            line(points_on_ellipse(amodal["centre_px"], amodal["semi_axes_px"], amodal["angle_rad"], 90), closed=True)
+    for lid in (lids or {}).values():
+        line(np.array(lid), closed=False)
+    for glint in labels["glints"]:
+        if glint["xy_px"] is not None:
+            x, y = glint["xy_px"][0] - x0, glint["xy_px"][1] - y0
+            pen.ellipse((x - 2 * stroke, y - 2 * stroke, x + 2 * stroke, y + 2 * stroke), outline=0)
+    return np.asarray(picture)
 
 
 def _of_scene(scene: Scene, backend: BackendChoice, threads: int | None) -> Iterator[tuple[int, Tile, bool]]:

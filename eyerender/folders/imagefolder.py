@@ -27,7 +27,7 @@ from ..base.versions import package_version
 from ..rig.camera import Window
 from ..scene.observation import EYES, Observations, concatenate, count_heads
 from .imagefile import MAX_IMAGE_BYTES, array_of, image_of
-from .packed import INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
+from .packed import DEEP, INDEX, INDEX_TYPE, MEMBERS, PackedLines, read_member
 
 IMAGE_SCHEMA = "eyerender/image/5"
 """Schema of a line of metadata."""
@@ -291,7 +291,8 @@ class ImageEntry:
 class Entries(Sequence[ImageEntry]):
     """Images of a folder. Each line of metadata is read and checked when its entry is requested, and not kept.
 
-    Iteration is faster than access by index. A slice is another such sequence.
+    Iteration is faster than access by index. A slice is another such sequence. `brief` ones have lines without records,
+    labels and parameters, which take most of the time to read.
 
     Raises:
         InputError: on access; the line is wrong (the message names line and key), or the file has changed.
@@ -300,6 +301,7 @@ class Entries(Sequence[ImageEntry]):
     folder: Path
     lines: LineFiles | PackedLines
     rows: range
+    brief: bool = False
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -310,14 +312,21 @@ class Entries(Sequence[ImageEntry]):
     def __getitem__(self, at: slice) -> Entries: ...
     def __getitem__(self, at: int | slice) -> ImageEntry | Entries:
         if isinstance(at, slice):
-            return Entries(self.folder, self.lines, self.rows[at])
+            return replace(self, rows=self.rows[at])
         row = self.rows[at]
-        return next(iter(Entries(self.folder, self.lines, range(row, row + 1))))
+        return next(self._read(range(row, row + 1)))
 
     def __iter__(self) -> Iterator[ImageEntry]:
+        return self._read(self.rows)
+
+    def _read(self, rows: range) -> Iterator[ImageEntry]:
         packed = isinstance(self.lines, PackedLines)
-        for path, number, line in self.lines.read(self.rows):
-            _check_line(line, str(path), f"line {number}")
+        found = self.lines.read(rows, before=DEEP[0] if self.brief else "")
+        for row, (path, number, line) in zip(rows, found, strict=False):  # `strict` would read on after the last one
+            if self.brief and "window_px" not in line:  # another program has written the keys in another order
+                yield from replace(self, brief=False)._read(range(row, row + 1))
+                continue
+            _check_line(line, str(path), f"line {number}", brief=self.brief)
             members = line.pop(MEMBERS, None) if packed else None
             if packed and not isinstance(members, dict):
                 raise InputError("must be a mapping", source=str(path), path=f"line {number}.{MEMBERS}")
@@ -538,8 +547,8 @@ def _entries(folder: Path, lines: LineFiles | PackedLines, source: Path, nothing
     return entries
 
 
-def _check_line(line: dict[str, Any], source: str, where: str) -> None:
-    """Check the files, names and window of a line; other keys are not checked.
+def _check_line(line: dict[str, Any], source: str, where: str, *, brief: bool) -> None:
+    """Check the files, names, window and, if they are not left out, records of a line; other keys are not checked.
 
     Raises:
         InputError: a value cannot be used.
@@ -566,7 +575,8 @@ def _check_line(line: dict[str, Any], source: str, where: str) -> None:
     if gamma is not None and (isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0.1 <= gamma <= 10):
         refuse("gamma", "must be 0.1 to 10")
     _check_names(line, refuse)
-    _check_records(line.get("records"), refuse)
+    if not brief:
+        _check_records(line.get("records"), refuse)
 
 
 def _check_names(line: dict[str, Any], refuse: Refuse) -> None:

@@ -40,6 +40,8 @@ MEMBERS = "tar_members"  # key of a packed line: key of a file's name -> first b
 _MAX_TABLE_BYTES = 64 * 2**20
 _GZIP = 31  # zlib's `wbits` for a gzip member
 _TEXTS = ("scene_json", "eye_json")  # JSON as text, whose numbers stay exact
+DEEP = ("records", "labels", "parameters")
+"""Last keys of a line, with nearly all of its values. Reading a picture does not need them."""
 _PLACE = re.compile(r"\[\d+\]")
 Leaves = dict[tuple[str, ...], Any]
 """Values of a JSON tree by the keys that lead to them."""
@@ -146,9 +148,9 @@ def _opened(line: Mapping[str, Any]) -> Leaves:
     return dict(_leaves({**rounded({**line, "parameters": parameters}), **texts}))
 
 
-def _closed(leaves: Leaves) -> dict[str, Any]:
+def _closed(leaves: Leaves, brief: bool) -> dict[str, Any]:
     line: dict[str, Any] = _lists(_tree(leaves))
-    for key in _TEXTS:
+    for key in () if brief else _TEXTS:
         line["parameters"][key] = json.dumps(line.pop(key), sort_keys=True)
     return line
 
@@ -175,15 +177,20 @@ class _Head:
     shapes: list[list[tuple[str, ...]]]
 
 
+def _shallow(leaves: Iterable[tuple[tuple[str, ...], Any]]) -> Leaves:
+    """Return the values that are not below one of the keys `DEEP`."""
+    return {path: value for path, value in leaves if path[0] not in DEEP and path[0] not in _TEXTS}
+
+
 @lru_cache(maxsize=128)
-def _head(path: str, state: tuple[int, ...]) -> _Head:
+def _head(path: str, state: tuple[int, ...], brief: bool) -> _Head:
     del state  # of the file, so that a replaced file is read again
     (text,) = _inflated(path, 0)
     head = parse_json(text, source=path)
     if not isinstance(head, dict) or head.get("schema") != LINES_SCHEMA:
         raise InputError(f"must begin with {LINES_SCHEMA!r}", source=path)
-    shared, paths = dict(_leaves(head["shared"])), [tuple(path) for path in head["paths"]]
-    tables = {group: dict(_leaves(table)) for group, table in head["tables"].items()}
+    kept, paths = _shallow if brief else dict, [tuple(path) for path in head["paths"]]
+    shared, tables = kept(_leaves(head["shared"])), {k: kept(_leaves(own)) for k, own in head["tables"].items()}
     return _Head(shared, tables, [[paths[k] for k in shape] for shape in head["shapes"]])
 
 
@@ -215,8 +222,8 @@ def _inflated(path: str, first: int) -> list[bytes]:
     return b"".join(parts).splitlines()
 
 
-def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
-    """Read the metadata in a row of a shard, whose gzip member begins at byte `block`.
+def read_line(path: Path, row: int, block: int, *, brief: bool = False) -> dict[str, Any]:
+    """Read the metadata in a row of a shard, whose gzip member begins at byte `block`; `brief` omits the keys `DEEP`.
 
     Raises:
         InputError: the file or the line is wrong.
@@ -229,8 +236,8 @@ def read_line(path: Path, row: int, block: int) -> dict[str, Any]:
         if len(text) > MAX_LINE_BYTES:
             raise InputError(f"is too long (at most {MAX_LINE_BYTES} bytes are read)", source=name, path=where)
         group, shape, *values = parse_json(text, source=name, path=where)
-        head = _head(name, state)
-        return _closed(head.shared | head.tables[group] | dict(zip(head.shapes[shape], values, strict=True)))
+        head, own = _head(name, state, brief), zip(_head(name, state, brief).shapes[shape], values, strict=True)
+        return _closed(head.shared | head.tables[group] | (_shallow(own) if brief else dict(own)), brief)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", source=name) from None
     except WRONG as error:
@@ -304,8 +311,8 @@ class PackedLines:
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(self.rows["split"] == self.splits.index(split))
 
-    def read(self, rows: range) -> Iterator[tuple[Path, int, dict[str, Any]]]:
-        """Read some lines: the file, the line number in it from 1, and the object.
+    def read(self, rows: range, *, before: str = "") -> Iterator[tuple[Path, int, dict[str, Any]]]:
+        """Read some lines: the file, the line number in it from 1, and the object; with `before`, without `DEEP`.
 
         Raises:
             InputError: as `read_line`.
@@ -313,4 +320,4 @@ class PackedLines:
         for at in rows:
             own = self.rows[at]
             path = self.folder / "shards" / f"{int(own['shard']):05d}" / LINES_GZ
-            yield path, int(own["row"]) + 1, read_line(path, int(own["row"]), int(own["block"]))
+            yield path, int(own["row"]) + 1, read_line(path, int(own["row"]), int(own["block"]), brief=bool(before))

@@ -256,7 +256,7 @@ def test_a_run_is_not_gone_on_with_when_a_file_has_changed(made, tmp_path, capsy
     shutil.copytree(made / "spec", spec)
     shutil.copytree(made / "out", folder)
     shutil.rmtree(folder / "shards" / "00003")
-    (folder / "dataset.json").unlink()
+    stages.unassemble(folder)
     before = tree(folder)
     monkeypatch.chdir(tmp_path)
     kept = (spec / name).read_bytes()

@@ -12,6 +12,8 @@ import pytest
 from PIL import Image
 
 import eyerender as er
+from eyerender.dataset.sheet import outlines
+from eyerender.imaging.labels import EyeInWindow
 from tests.support.dataset_specs import mapping, plan, write
 from tests.support.paths import ROOT
 
@@ -94,6 +96,19 @@ def test_a_contact_sheet_of_objects(spec, tmp_path, given):
     assert er.preview(objects[given], tmp_path / "sheet.png", threads=1) == 1
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.width >= 96
+
+
+def test_outlines_of_a_plan_are_those_of_its_labels(tmp_path):
+    """The darkest ring of the drawing is the pupil's outline, where ray optics finds it."""
+    frames = er.sample(plan(), 3).scene.frames()
+    record = er.trace(frames)
+    drawn = outlines(frames, record)
+    x0, y0 = EyeInWindow.of(frames, 0).window[:2]
+    places = np.round(record.pupil.points_px[0] - [x0, y0]).astype(int)
+    assert (drawn[places[:, 1], places[:, 0]] == 0).mean() > 0.8  # the ellipse that fits them, one pixel wide
+    assert er.preview(plan(), tmp_path / "sheet.png", planned=True) == 16
+    with pytest.raises(er.InputError, match="--planned: takes a dataset spec"):
+        er.preview(er.sample(plan(), 0).scene, tmp_path / "scene.png", planned=True)
 
 
 def test_mistakes_in_arguments_are_one_line(spec, tmp_path):

@@ -20,6 +20,7 @@ from eyerender.apps.quickstart import compare_folder
 from eyerender.dataset.assemble import assemble
 from eyerender.dataset.done import sum_of
 from eyerender.dataset.export import FORMATS, export
+from eyerender.dataset.lines import restore_lines
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import withdraw_damaged
 from eyerender.dataset.validate import validate
@@ -32,7 +33,7 @@ from tests.support.fuzzing import CASES, budget, edited, garbled, proper, strict
 
 SECRET = b"the secret of another folder"
 JSON = ("dataset.json", "run.json", "shards/00000/done.json")
-LINES = ("metadata.jsonl", "shards/00000/lines.jsonl")
+LINES = ("metadata.jsonl",)
 FILES = (*JSON, *LINES, "images/00000", "masks/00000", "README.md")
 ACTIONS = (
     "read",
@@ -167,6 +168,7 @@ def use(folder: Path, action: str, out: Path) -> Any:
     if action == "resume":
         made = small()
         begin(folder, made, lambda _: None)
+        restore_lines(folder)
         withdraw_damaged(folder, sorted(finished(folder) & {0, 1}), made.digest)
         if {0, 1} <= finished(folder):
             strict_json(assemble(made, folder))

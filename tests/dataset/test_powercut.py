@@ -55,7 +55,6 @@ def repairing(tiny, tmp_path_factory):
     folder = shutil.copytree(tiny, place / "disk" / "out")
     for shard in (1, 2, 6):
         (folder / "shards" / f"{shard:05d}" / "lines.jsonl").write_bytes(b"")
-    (folder / "metadata.jsonl").unlink()
     shutil.copytree(place / "disk", place / "before")
     found = Disk(recorded(place, place / "disk"), start=place / "before")
     assert tree(folder) == tree(tiny)

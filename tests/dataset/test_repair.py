@@ -29,10 +29,11 @@ def first(folder, kind, shard):
     return sorted((folder / kind / f"{shard:05d}").iterdir())[0]
 
 
-def change_digit(path):
-    """Change one digit of a text."""
+def change_digit(path, first=""):
+    """Change one digit of a text, beyond its middle or beyond some words."""
     text = path.read_text()
-    at = next(k for k in range(len(text) // 2, len(text)) if text[k] in "123")
+    start = text.index(first) if first else len(text) // 2
+    at = next(k for k in range(start + len(first), len(text)) if text[k] in "123")
     path.write_text(text[:at] + str(int(text[at]) + 1) + text[at + 1 :])
 
 
@@ -52,7 +53,7 @@ def test_damaged_shards_are_made_again(tiny, tmp_path):
     folder = shutil.copytree(tiny, tmp_path / "copy")
     first(folder, "images", 0).unlink()
     flip_byte(first(folder, "masks", 1))
-    change_digit(folder / "shards" / "00002" / "lines.jsonl")
+    change_digit(folder / "metadata.jsonl", '"file_name": "images/00002/00000007-right.png", ')
     first(folder, "images", 3).write_bytes(b"")
     edit_done(folder, 4, digest="0" * 64)
     (folder / "shards" / "00005" / "done.json").write_bytes(b"")
@@ -74,6 +75,7 @@ def test_damaged_shards_are_made_again(tiny, tmp_path):
         7: "is of another shard",
     }
     found = [json.loads(line)["what"] for line in lines if '"event": "repair"' in line]
+    found = [what for what in found if what.startswith("shard ")]  # the dataset is assembled again, too
     for what, (shard, word) in zip(found, words.items(), strict=True):
         assert what.startswith(f"shard {shard} is made again: ")
         assert word in what
@@ -90,7 +92,7 @@ def test_damaged_shards_are_made_again(tiny, tmp_path):
         pytest.param(b'{"schema": "eyerender/', id="cut-short"),
     ],
 )
-@pytest.mark.parametrize("name", ["run.json", "dataset.json", "metadata.jsonl"])
+@pytest.mark.parametrize("name", ["run.json", "dataset.json"])
 def test_damaged_files_of_the_dataset_are_written_again(tiny, tmp_path, name, content):
     folder = shutil.copytree(tiny, tmp_path / "copy")
     (folder / name).unlink()
@@ -102,6 +104,17 @@ def test_damaged_files_of_the_dataset_are_written_again(tiny, tmp_path, name, co
     assert len(repairs(folder)) == 1
     assert name in repairs(folder)[0]
     assert done["said"] == [f"repairing: {repairs(folder)[0]}"]
+
+
+@pytest.mark.parametrize("content", [None, b'{"schema": "eyerender/'])
+def test_shards_whose_lines_are_lost_are_made_again(tiny, tmp_path, content):
+    """A finished dataset holds the lines of its shards once, in metadata.jsonl."""
+    folder = shutil.copytree(tiny, tmp_path / "copy")
+    (folder / "metadata.jsonl").unlink()
+    if content is not None:
+        (folder / "metadata.jsonl").write_bytes(content)
+    assert make(folder, plan())["shards_made"] == 8
+    assert tree(folder) == tree(tiny)
 
 
 @pytest.mark.parametrize("content", [None, ""])
@@ -201,7 +214,7 @@ def test_a_quick_check_compares_sizes(tiny, tmp_path):
     assert len(list(verify_dataset(folder))) == 2
 
 
-@pytest.mark.parametrize("name", ["metadata.jsonl", "shards/00002/lines.jsonl", "masks", "shards/00002/done.json"])
+@pytest.mark.parametrize("name", ["metadata.jsonl", "masks", "shards/00002/done.json"])
 def test_nothing_damaged_is_exported(tiny, tmp_path, capsys, name):
     folder = shutil.copytree(tiny, tmp_path / "copy")
     if name == "masks":

@@ -16,6 +16,7 @@ from eyerender.dataset.rounding import rounding
 from eyerender.dataset.run import generate
 from tests.support.dataset_specs import make_or_skip, plan
 from tests.support.paths import ROOT
+from tests.support.stages import unassemble
 
 
 def elsewhere(**settings):
@@ -58,7 +59,7 @@ def test_parts_that_round_differently_are_named_or_refused(two, tmp_path):
     folder = shutil.copytree(two, tmp_path / "copy")
     path = folder / "shards" / "00001" / "done.json"
     path.write_text(json.dumps({**content(path), "rounding": "0" * 16}), encoding="utf-8")
-    (folder / "dataset.json").unlink()
+    unassemble(folder)
     with pytest.raises(InputError, match=r"another rounding made the shards 1,.*--same-bytes"):
         generate(small(), folder, workers=1, same_bytes=True)
     said: list[str] = []

@@ -262,9 +262,15 @@ def test_samples_given_up_are_recorded(tmp_path):
             "shard_size": 2,
         }
     )
-    done = make(tmp_path / "some", made)
+    warnings = []
+    done = make(tmp_path / "some", made, warn=warnings.extend)
     assert done["statistics"]["samples_given_up"] == 2
+    assert done["statistics"]["subjects_left_out"] == 0
     assert done["statistics"]["images"] == 2
+    assert [w.reason for w in warnings if w.code == "given-up"] == [
+        "2 of 4 samples could not be made, and 0 subjects have no image, so the dataset may be biased "
+        "(failures.jsonl has the reasons)"
+    ]
     failures = [json.loads(line) for line in (tmp_path / "some" / "failures.jsonl").read_text().splitlines()]
     assert [f["sample"] for f in failures] == [1, 3]
     assert all("cannot fixate" in f["reason"] for f in failures)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from eyerender.dataset.estimate import Speed, keep_rate, last_rate
 from eyerender.dataset.options import PlanOptions
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.shard import Staged
+from eyerender.dataset.validate import validate
 from eyerender.folders.imagefolder import ImageFolder
+from eyerender.folders.packed import DEEP
 from tests.support.dataset_specs import plan, write
 from tests.support.in_process import single_workers_in_process
 
@@ -44,6 +47,18 @@ def test_the_stated_bytes_are_those_of_the_folder(folders, layout, capsys, monke
     once = ("README.md", "croissant.json", "dataset.json", "run.json", "log.jsonl", "index.npy")
     growing = sum(path.stat().st_size for path in files if path.name not in once) / images
     assert json.loads(capsys.readouterr().out)["bytes"] / images == pytest.approx(growing, rel=0.1)
+
+
+@pytest.mark.render
+def test_the_metadata_is_there_once(folders):
+    """Shards keep the checksums of their lines, and pictures are read without the labels."""
+    assert not list((folders / "files").rglob("lines.jsonl"))
+    assert validate(folders / "files", quick=True)["ok"]
+    for layout in ("files", "webdataset"):
+        entries = ImageFolder.load(folders / layout).entries
+        for brief, whole in zip(replace(entries, brief=True), entries, strict=True):
+            assert brief.line == {key: value for key, value in whole.line.items() if key not in DEEP}
+            np.testing.assert_array_equal(brief.mask(), whole.mask())
 
 
 @pytest.mark.render

@@ -20,6 +20,7 @@ from eyerender.imaging.labels import EyeInWindow, known_labels
 from eyerender.imaging.lines import image_line
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping
+from tests.support.stages import unassemble
 
 pytestmark = pytest.mark.render
 
@@ -114,7 +115,7 @@ def test_wrong_lines_are_found(copy, change, words):
 
 
 def test_what_is_finished_of_a_run_is_validated_and_exported(copy, tmp_path, capsys):
-    (copy / "dataset.json").unlink()
+    unassemble(copy)
     (copy / "metadata.jsonl").write_text("of an earlier run\n")
     for shard in (2, 5):
         (copy / "shards" / f"{shard:05d}" / "done.json").unlink()
@@ -133,7 +134,7 @@ def test_what_is_finished_of_a_run_is_validated_and_exported(copy, tmp_path, cap
 
 
 def test_damage_of_an_unfinished_run_is_found(copy, tmp_path):
-    (copy / "dataset.json").unlink()
+    unassemble(copy)
     edit(copy, 4, lambda line: line["records"][0].pop("pose"))
     with pytest.warns(UnfinishedRunWarning):
         found = validate(copy)["problems"]
@@ -144,7 +145,7 @@ def test_damage_of_an_unfinished_run_is_found(copy, tmp_path):
 
 
 def test_what_is_no_dataset_is_refused(copy, tmp_path):
-    (copy / "dataset.json").unlink()
+    unassemble(copy)
     shutil.rmtree(copy / "shards")
     with pytest.raises(InputError, match="an unfinished run without a finished shard"):
         validate(copy)

@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.apps.inspection import inspect
 from eyerender.apps.inspection.dependence import dependences
-from eyerender.apps.inspection.planned import may_depend, ordered_draws, planned_mapping
+from eyerender.apps.inspection.planned import draw_plan, may_depend, ordered_draws
 from eyerender.base.errors import InputError
 from eyerender.dataset.options import PlanOptions
 from eyerender.dataset.plan import Plan
@@ -125,8 +125,8 @@ def test_the_draws_of_shipped_recipes_are_independent(name):
     # Datasets of few subjects get more, so that they can be tested.
     changes = PlanOptions(subjects=80) if name.startswith("dataset_") else PlanOptions()
     plan = Plan.load(name, changes=changes)
-    found = planned_mapping(plan, 240, None)
-    assert [one for one in found["dependences"] if not one["declared"]] == []
+    found = draw_plan(plan, 240, None)
+    assert [one for one in found.dependences if not one.declared] == []
     # Each value of a sequence occurs in the first 16 samples.
     first = [plan.draw(k).draws for k in plan.spread(16)]
     for name in ordered_draws(plan):
@@ -135,5 +135,9 @@ def test_the_draws_of_shipped_recipes_are_independent(name):
 
 
 def test_a_plan_is_inspected_alone(tmp_path):
-    with pytest.raises(InputError, match="--planned: takes one spec, and writes no page"):
-        inspect("dataset_quick", planned=True, output=tmp_path / "page.html")
+    with pytest.raises(InputError, match="--planned: takes one spec"):
+        inspect("dataset_quick", "dataset_region", planned=True)
+    (found,) = inspect("dataset_quick", planned=True, images=24, output=tmp_path / "page.html")["datasets"]
+    page = (tmp_path / "page.html").read_text()
+    assert "24 of its" in page
+    assert all(name.removeprefix("draw ") in page for name in found["columns"])

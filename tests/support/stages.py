@@ -11,6 +11,8 @@ import re
 import subprocess
 from pathlib import Path
 
+from eyerender.dataset.lines import restore_lines
+
 _HOOK = """
 import os
 import re
@@ -82,3 +84,9 @@ def cuts(draws: random.Random, total: int, parts: int) -> list[int]:
     """
     ends = sorted(draws.sample(range(1, total), parts - 1))
     return [end - start for start, end in zip([0, *ends], ends, strict=False)]
+
+
+def unassemble(folder: Path) -> None:
+    """Take a finished dataset back to the stage before its assembly: shards have their own lines, no dataset.json."""
+    restore_lines(folder)
+    (folder / "dataset.json").unlink()

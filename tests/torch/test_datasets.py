@@ -18,6 +18,7 @@ from eyerender.base.errors import InputError, UnfinishedRunWarning
 from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import plan
 from tests.support.paths import ROOT
+from tests.support.stages import unassemble
 
 torch = pytest.importorskip("torch", reason="needs PyTorch; run ./scripts/test-torch")
 
@@ -65,7 +66,7 @@ def without_files(lines):
 
 def test_what_is_finished_of_a_run_can_be_trained_on(folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "copy")
-    (copy / "dataset.json").unlink()
+    unassemble(copy)
     shards = sorted((copy / "shards").iterdir())
     (shards[1] / "done.json").unlink()
     lost = {json.loads(line)["sample"] for line in (shards[1] / "lines.jsonl").read_text().splitlines()}

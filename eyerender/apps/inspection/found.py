@@ -17,6 +17,7 @@ from .missing import MissingLabels
 from .outliers import Outlier
 from .reading import Contents
 from .statistics import Distribution, strongest
+from .worst import WorstPicture
 
 _LISTED = 100  # images of each kind of fault in the JSON
 _PAIRS = 40
@@ -33,6 +34,7 @@ class Inspection:
         equal: places of pictures with the same pixels, by groups.
         near: pairs of near-duplicates.
         outliers: the most unusual images.
+        worst: the worst pictures by simple figures.
         distributions: of each column.
         correlated: names of the columns that vary, and (m, m) their rank correlations.
         missing: labels that more than 2 % of the images lack.
@@ -46,6 +48,7 @@ class Inspection:
     equal: list[list[int]]
     near: list[SimilarPair]
     outliers: list[Outlier]
+    worst: list[WorstPicture]
     distributions: dict[str, Distribution]
     correlated: tuple[list[str], Floats]
     missing: list[MissingLabels]
@@ -79,12 +82,13 @@ class Inspection:
             "unfinished": bool(c.folder.unfinished),
             "splits": {name: {"images": n, "subjects": len(own)} for name, (n, own) in self.splits.items()},
             "subjects_in_two_splits": {str(subject): names for subject, names in self.shared.items()},
-            "groups": {name: _counts(values) for name, values in c.groups.items()},
+            "groups": {name: counts_of(values) for name, values in c.groups.items()},
             "faults": {kind: self._listed(found) for kind, found in self.faults().items()},
             "outliers": [
                 {"image": self.name(o.at), "distance": o.distance, "reasons": [asdict(r) for r in o.reasons]}
                 for o in self.outliers
             ],
+            "worst": [{"image": self.name(w.at), "figure": w.figure, "value": w.value} for w in self.worst],
             "near_duplicates": [[self.name(p.first), self.name(p.second), p.correlation] for p in self.near[:_LISTED]],
             "columns": {name: d.to_mapping() for name, d in self.distributions.items()},
             "shares": self.shares,
@@ -98,6 +102,7 @@ class Inspection:
         return {"count": len(found), "images": images}
 
 
-def _counts(values: Any) -> dict[str, int]:
+def counts_of(values: Any) -> dict[str, int]:
+    """Count the images that have each value of a group."""
     kinds, counts = np.unique([str(v) for v in values if v is not None], return_counts=True)
     return {str(kind): int(count) for kind, count in zip(kinds, counts, strict=True)}

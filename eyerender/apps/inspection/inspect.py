@@ -19,10 +19,11 @@ from .faults import KINDS, Fault
 from .found import Inspection
 from .missing import missing_labels
 from .outliers import outliers
-from .planned import dependences_of, planned_mapping
+from .planned import dependences_of, draw_plan
 from .reading import Contents, matrix, read, split_of_subjects
 from .statistics import distribution, rank_correlations
 from .training import shares_of
+from .worst import worst_pictures
 
 SCHEMA = "eyerender/inspection/1"
 IMAGES = 100_000
@@ -59,13 +60,17 @@ def inspect(
     """
     if images < 1:
         raise InputError("must be >= 1", source="--images")
-    if planned:
-        if output is not None or other is not None:
-            raise InputError("takes one spec, and writes no page", source="--planned")
-        drawn = planned_mapping(folder, images, progress)
-        return {"schema": SCHEMA, "kinds": dict(KINDS), "datasets": [drawn], "difference": None}
     if output is not None:
         refuse_special(output)
+    if planned:
+        if other is not None:
+            raise InputError("takes one spec", source="--planned")
+        drawn = draw_plan(folder, images, progress)
+        if output is not None:
+            from .page import write_planned
+
+            write_planned(Path(output), drawn)
+        return {"schema": SCHEMA, "kinds": dict(KINDS), "datasets": [drawn.to_mapping()], "difference": None}
     paths = [folder] if other is None else [folder, other]
     found = [examine(read(path, limit=images, workers=workers, progress=progress)) for path in paths]
     moved = shifts(found[0].contents, found[1].contents) if other is not None else []
@@ -104,6 +109,7 @@ def examine(contents: Contents) -> Inspection:
         equal=equal,
         near=near,
         outliers=outliers(values, varying),
+        worst=worst_pictures(contents),
         distributions=distributions,
         correlated=(varying, rank_correlations(values)),
         missing=missing_labels(contents),

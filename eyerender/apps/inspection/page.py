@@ -14,15 +14,16 @@ from PIL import Image
 from ...base.arrays import Bytes, Ints
 from ...base.errors import WRONG, InputError
 from ...dataset.export.encoding import Encoding, measured_gain
-from ...folders.imagefolder import ImageEntry
+from ...folders.imagefolder import FILE_KEYS, ImageEntry
 from ...report.overlay import picture
 from ...report.page import Card, Content, Figure, Gallery, Key, Page, Section, Table, write_page
 from ...report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
 from .comparing import Shift, only_in, shares
-from .dependence import SUBJECTS
+from .dependence import SUBJECTS, Dependence
 from .faults import KINDS
 from .figures import DRAW, LABEL, PERSON, PICTURE
-from .found import Inspection
+from .found import Inspection, counts_of
+from .planned import PlannedDraws
 from .reading import Contents, spread
 from .statistics import Distribution, binned
 from .strata import strata
@@ -48,6 +49,19 @@ def write(path: Path, found: Sequence[Inspection], moved: Sequence[Shift]) -> No
         cards += _cards(one, before)
         sections += _dataset(one, before)
     write_page(path, Page(f"Dataset {' and '.join(names)}", lead, cards, sections))
+
+
+def write_planned(path: Path, drawn: PlannedDraws) -> None:
+    """Write the page of the draws of a plan."""
+    subjects = set().union(*(own for _, own in drawn.splits.values()))
+    lead = [f"{drawn.path}: {drawn.read} of its {drawn.images} samples were drawn. Nothing was rendered."]
+    cards = [Card(str(drawn.read), "samples"), Card(str(len(subjects)), "subjects")]
+    sections = {
+        "Dependences": _dependences(drawn.dependences),
+        "Splits": _splits(drawn.splits, {}),
+        "Distributions": _distributions(drawn.distributions),
+    }
+    write_page(path, Page(f"Plan {drawn.path}", lead, cards, [Section(name, *c) for name, c in sections.items()]))
 
 
 def _about(found: Inspection) -> str:
@@ -161,17 +175,19 @@ def _dataset(found: Inspection, before: str) -> list[Section]:
     """Return the sections of one dataset."""
     contents, pictures = found.contents, _Pictures(found.contents)
     sections: dict[str, Sequence[Content]] = {
+        "Contents": _contents(found),
         "Faults": _faults(found, pictures),
         "Shares": [
             Table(
                 ("quantity", "shares of the images"), [(k, _listed(own)) for k, own in found.shares.items()], wide=(1,)
             )
         ],
-        "Dependences": _dependences(found),
+        "Dependences": _dependences(found.dependences),
         "Missing labels": _missing(found),
+        "Worst pictures": _worst(found, pictures),
         "Outliers": _outliers(found, pictures),
         "Near-duplicates": _duplicates(found, pictures),
-        "Splits": _splits(found),
+        "Splits": _splits(found.splits, found.shared),
         "Contact sheet": [
             Gallery(
                 [pictures.tile(at, [_short(contents, at)]) for at in part.shown],
@@ -185,6 +201,35 @@ def _dataset(found: Inspection, before: str) -> list[Section]:
         "Correlations": _correlations(found),
     }
     return [Section(before + heading, *content) for heading, content in sections.items()]
+
+
+def _contents(found: Inspection) -> list[Content]:
+    """Tell what a dataset consists of: licence, kinds of pictures, and how many images each group has."""
+    c, spec = found.contents, found.contents.folder.dataset.get("spec")
+    entry = next((c.entry(at) for at in range(len(c)) if c.names[at]), None)
+    rows = [("licence", str((spec if isinstance(spec, dict) else {}).get("licence") or "none is stated"))]
+    if entry is not None:
+        kinds = [key.removesuffix("_file_name") for key in FILE_KEYS[1:] if entry.line.get(key) is not None]
+        rows += [("labels as pictures", ", ".join(kinds) or "none"), ("bits", str(entry.line.get("bit_depth")))]
+    sizes = [c.columns.get(f"{LABEL}window {name} (px)", np.zeros(0)) for name in ("width", "height")]
+    rows.append(
+        ("sizes", ", ".join(f"{w:.0f} x {h:.0f} px" for w, h in sorted(set(zip(*sizes, strict=False)))[:_NAMED]))
+    )
+    for name, values in c.groups.items():
+        counts = list(counts_of(values).items())
+        more = f" and {len(counts) - _NAMED} more" if len(counts) > _NAMED else ""
+        rows.append((name, ", ".join(f"{value or '-'}: {n}" for value, n in counts[:_NAMED]) + more))
+    return [Table(("what", "images that were read"), rows, wide=(1,))]
+
+
+def _worst(found: Inspection, pictures: _Pictures) -> list[Content]:
+    if not found.worst:
+        return ["No picture has such figures."]
+    tiles = [pictures.tile(w.at, [found.name(w.at), f"{w.figure}: {w.value:.3g}"]) for w in found.worst]
+    return [
+        "The worst pictures by simple figures. They may be meant: look whether you want to train on them.",
+        Gallery(tiles),
+    ]
 
 
 def _faults(found: Inspection, pictures: _Pictures) -> list[Content]:
@@ -205,11 +250,11 @@ def _listed(shares: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
 
 
-def _dependences(found: Inspection) -> list[Content]:
-    if found.dependences is None:
+def _dependences(found: Sequence[Dependence] | None) -> list[Content]:
+    if found is None:
         return [f"Not tested, which needs {SUBJECTS} subjects."]
-    rows = [(a, b, f"{rho:+.2f}", f"{p:.1e}", "yes" if ok else "no") for a, b, rho, p, ok in found.dependences]
-    count = sum(not own.declared for own in found.dependences)
+    rows = [(a, b, f"{rho:+.2f}", f"{p:.1e}", "yes" if ok else "no") for a, b, rho, p, ok in found]
+    count = sum(not own.declared for own in found)
     text = f"{count or 'No'} pairs of draws and labels depend on each other without being declared to."
     header = ("number", "number", "rank correlation", "p of the page", "declared")
     return [text, Table(header, rows, "Pairs that depend on each other", wide=(0, 1), folded=True) if rows else None]
@@ -272,18 +317,18 @@ def _short(contents: Contents, at: int) -> str:
     return f"subject {contents.subjects[at]}" if contents.subjects[at] >= 0 else contents.names[at]
 
 
-def _splits(found: Inspection) -> list[Content]:
-    total = sum(n for n, _ in found.splits.values())
+def _splits(splits: Mapping[str, tuple[int, set[int]]], shared: Mapping[int, Sequence[str]]) -> list[Content]:
+    total = sum(n for n, _ in splits.values())
     rows = []
-    for name, (images, subjects) in found.splits.items():
+    for name, (images, subjects) in splits.items():
         per = f"{images / len(subjects):.1f}" if subjects else "-"
         rows.append((name or "-", str(images), f"{images / total:.1%}", str(len(subjects)), per))
-    shared = [(str(subject), ", ".join(names)) for subject, names in list(found.shared.items())[:50]]
-    count = f"{len(found.shared)} subjects are" if shared else "No subject is"
+    listed = [(str(subject), ", ".join(names)) for subject, names in list(shared.items())[:50]]
+    count = f"{len(shared)} subjects are" if shared else "No subject is"
     return [
         Table(("split", "images", "share", "subjects", "images per subject"), rows),
         f"{count} in more than one split.",
-        Table(("subject", "splits"), shared) if shared else None,
+        Table(("subject", "splits"), listed) if listed else None,
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from .dependence import Dependence, dependences
 from .figures import DRAW, LABEL, PERSON, draws_of
 from .missing import levels
 from .reading import Contents
-from .statistics import distribution
+from .statistics import Distribution, distribution
 
 _AZIMUTH = f"{LABEL}eye azimuth (deg)"
 _LABELS = (_AZIMUTH, f"{LABEL}eye elevation (deg)", f"{LABEL}pupil stop diameter (mm)")
@@ -41,8 +42,38 @@ def dependences_of(contents: Contents) -> list[Dependence] | None:
     return dependences(numbers, contents.subjects, may_depend(ordered))
 
 
-def planned_mapping(given: str | Path | Plan, limit: int, progress: Progress | None) -> dict[str, Any]:
-    """Draw up to `limit` samples of a spec or a plan, spread evenly over it, and return what the JSON holds of them.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedDraws:
+    """Draws of the samples of a plan.
+
+    Attributes:
+        path: the spec.
+        images: number of samples of the plan.
+        read: number of samples that were drawn.
+        splits, distributions, dependences: as of an `Inspection`.
+    """
+
+    path: str
+    images: int
+    read: int
+    splits: dict[str, tuple[int, set[int]]]
+    distributions: dict[str, Distribution]
+    dependences: list[Dependence] | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what the JSON holds of the plan."""
+        return {
+            "path": self.path,
+            "images": self.images,
+            "images_read": self.read,
+            "splits": {name: {"images": n, "subjects": len(own)} for name, (n, own) in self.splits.items()},
+            "columns": {name: d.to_mapping() for name, d in self.distributions.items()},
+            "dependences": None if self.dependences is None else [one._asdict() for one in self.dependences],
+        }
+
+
+def draw_plan(given: str | Path | Plan, limit: int, progress: Progress | None) -> PlannedDraws:
+    """Draw up to `limit` samples of a spec or a plan, spread evenly over it, without rendering.
 
     Raises:
         InputError: the spec cannot be read, or a sample not be drawn.
@@ -58,16 +89,15 @@ def planned_mapping(given: str | Path | Plan, limit: int, progress: Progress | N
             columns.setdefault(name, np.full(len(samples), np.nan))[at] = value
         notify(progress, at + 1, len(samples), "samples")
     numbers = _tested(columns, {_SPLIT: splits}, np.array(samples))
-    found = dependences(numbers, subjects, may_depend(ordered_draws(plan)))
     own = {name: splits == name for name in sorted(set(splits.tolist()))}
-    return {
-        "path": plan.spec.name if isinstance(given, Plan) else str(given),
-        "images": plan.spec.count,
-        "images_read": len(samples),
-        "splits": {k: {"images": int(v.sum()), "subjects": len(set(subjects[v].tolist()))} for k, v in own.items()},
-        "columns": {name: distribution(name, column).to_mapping() for name, column in sorted(columns.items())},
-        "dependences": None if found is None else [one._asdict() for one in found],
-    }
+    return PlannedDraws(
+        path=plan.spec.name if isinstance(given, Plan) else str(given),
+        images=plan.spec.count,
+        read=len(samples),
+        splits={name: (int(rows.sum()), set(subjects[rows].tolist())) for name, rows in own.items()},
+        distributions={name: distribution(name, column) for name, column in sorted(columns.items())},
+        dependences=dependences(numbers, subjects, may_depend(ordered_draws(plan))),
+    )
 
 
 def ordered_draws(plan: Plan) -> set[str]:

@@ -65,8 +65,12 @@ class JsonLines:
     def __len__(self) -> int:
         return len(self.starts) - 1
 
-    def read(self, rows: range) -> Iterator[dict[str, Any]]:
+    def read(self, rows: range, *, before: str = "") -> Iterator[dict[str, Any]]:
         """Read the objects of some lines, counted from 0.
+
+        Args:
+            rows: the lines.
+            before: read only the keys in front of this one, where `json.dumps` wrote the line; "": all keys.
 
         Raises:
             InputError: a line is not a JSON object, or the file has changed since it was indexed.
@@ -82,7 +86,9 @@ class JsonLines:
                 if file.tell() != start:
                     file.seek(start)
                 where = f"line {row + 1}"
-                value = parse_json(file.read(end - start), source=source, path=where)
+                text = file.read(end - start)
+                head, found, _ = text.partition(b', "' + before.encode() + b'": ')
+                value = parse_json(head + b"}" if before and found else text, source=source, path=where)
                 if not isinstance(value, dict):
                     raise InputError("must be a JSON object", source=source, path=where)
                 yield value
@@ -104,10 +110,11 @@ class LineFiles:
     def __len__(self) -> int:
         return int(self.ends[-1]) if len(self.ends) else 0
 
-    def read(self, rows: range) -> Iterator[tuple[Path, int, dict[str, Any]]]:
+    def read(self, rows: range, *, before: str = "") -> Iterator[tuple[Path, int, dict[str, Any]]]:
         """Read some lines, counted from 0 over all files: the file, the line's number in it, the object.
 
-        `rows` may have any step; lines in increasing order are read fastest. Line numbers count from 1.
+        `rows` may have any step; lines in increasing order are read fastest. Line numbers count from 1. `before` is as
+        for `JsonLines.read`.
 
         Raises:
             InputError: as `JsonLines.read`.
@@ -120,7 +127,7 @@ class LineFiles:
             while stop < len(rows) and first <= rows[stop] < int(self.ends[file]):
                 stop += 1
             own = range(rows[at] - first, rows[stop - 1] - first + (1 if rows.step > 0 else -1), rows.step)
-            for row, value in zip(own, self.files[file].read(own), strict=True):
+            for row, value in zip(own, self.files[file].read(own, before=before), strict=True):
                 yield self.files[file].path, row + 1, value
             at = stop
 

@@ -30,7 +30,6 @@ from .keypoints import box, keypoints, mirrored_order, names
 CLASSES = ("eye", "iris", "pupil")
 _FROM = (SCLERA, IRIS, PUPIL)  # the first part of a mask that belongs to each class
 _LEAST_PX = 20
-_TOLERANCE_PX = 0.25  # of polygons
 _INSET_PX = 0.01
 _EDGE = 1e-6  # of shares: their rounding does not lead out of the image
 # What the splits are called in data.yaml.
@@ -93,22 +92,25 @@ def _pose(item: Item, lights: int) -> Iterator[str]:
 def _shares(points: Floats, shape: tuple[int, ...]) -> Iterator[str]:
     """Places (n, 2) in pixels, centres at integers, as shares of the image's width and height."""
     shares = np.clip((points + 0.5) / [shape[1], shape[0]], 0.0, 1.0)
-    return (f"{number:.6f}" for number in shares.ravel())
+    return (f"{number:.6f}" for number in shares.ravel().tolist())
 
 
 def polygons(inside: Bools) -> list[Floats]:
     """Outline each connected part of a mask as a polygon (n, 2), x and y in pixels; holes are filled."""
-    from skimage.measure import approximate_polygon, find_contours
+    from skimage.measure import find_contours
 
-    parts, count = ndimage.label(inside)
+    parts, _ = ndimage.label(inside)
     out = []
-    for number in range(1, count + 1):
-        part = ndimage.binary_fill_holes(parts == number)
-        if np.count_nonzero(part) <= _LEAST_PX:
+    for number, (rows, columns) in enumerate(ndimage.find_objects(parts), start=1):
+        # Lashes leave many parts of a few pixels, so only the box of each is looked at.
+        box = parts[rows, columns]
+        if box.size <= _LEAST_PX or np.count_nonzero(part := ndimage.binary_fill_holes(box == number)) <= _LEAST_PX:
             continue
-        outline = max(find_contours(np.pad(part, 1).astype(float), 0.5), key=len) - 1.0  # type: ignore[no-untyped-call]
-        polygon = approximate_polygon(outline, _TOLERANCE_PX)[:-1]  # type: ignore[no-untyped-call]
-        out.append(_drawn_in(np.asarray(polygon), part)[:, ::-1])
+        outline = max(find_contours(np.pad(part, 1).astype(float), 0.5), key=len)[:-1] - 1.0  # type: ignore[no-untyped-call]
+        y, x = outline.T
+        # Points on a straight line between their neighbours are left out.
+        turns = (x - np.roll(x, 1)) * (np.roll(y, -1) - y) != (y - np.roll(y, 1)) * (np.roll(x, -1) - x)
+        out.append(_drawn_in(outline[turns], part)[:, ::-1] + (columns.start, rows.start))
     return out
 
 

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ...base.errors import WRONG, InputError
 from ..draws import is_draw
 from .augment import Augmentation
-from .item import PARTS, PixelsOf, TrainingItem, part_of, pixels_of
+from .item import PARTS, PICTURES, PixelsOf, TrainingItem, part_of, pixels_of
 from .place import Placement, mirrored, placed
 from .symmetry import mirrored_lamps
 
@@ -54,6 +56,11 @@ class Preparation:
         """Whether items may be mirrored, and say so."""
         return self.mirror_left or self.augment is not None
 
+    @property
+    def reads_labels(self) -> bool:
+        """Whether more of a line is needed than what finds its pictures."""
+        return self.mirror_left or self.augment is not None or not set(self.parts) <= PICTURES.keys()
+
     def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:
         """Read an item; left eyes are mirrored if asked for.
 
@@ -68,7 +75,7 @@ class Preparation:
         parts: dict[str, Any] = {}
         part, linear, lights = "visible_fraction", self.encoding == "linear", self.lights
         try:
-            shown = part_of(part, line, picture, linear=linear, lights=lights)
+            shown = part_of(part, line, picture, linear=linear, lights=lights) if self.reads_labels else np.full(2, np.nan)
             for part in self.parts:
                 parts[part] = part_of(part, line, picture, linear=linear, lights=lights)
             part, window, mask = "mask", line["window_px"], parts.get("mask")
@@ -78,7 +85,7 @@ class Preparation:
                 parts=parts,
                 size=(window["width"], window["height"]),
                 shown=shown,
-                there=bool(line["labels"].get("eye_present", True)),
+                there=not self.reads_labels or bool(line["labels"].get("eye_present", True)),
                 mask=mask,
                 lamps=mirrored_lamps(line) if self.flags else None,
             )

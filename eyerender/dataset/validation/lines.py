@@ -5,6 +5,7 @@ Only a few bytes are kept of each line.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,7 +19,6 @@ from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
 from ...rig.plausibility import EXPOSURE_REMEDY
 from ...scene.observation import Observations
 from .problems import FolderProblems
-from .shards import hashed
 from .truth import DatasetTruth, SceneTruth
 
 # Labels that every image of a dataset has, whatever is visible.
@@ -176,3 +176,8 @@ def _keys(line: dict[str, Any]) -> tuple[set[str], set[str]]:
 
     collect(line, "")
     return found, nulls
+
+
+def hashed(data: bytes) -> int:
+    """Return a 64-bit hash."""
+    return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")

@@ -147,7 +147,7 @@ class DatasetTruth:
         scene, view = frames.scene, EyeInWindow.of(frames, row)
         _, expected = sample_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
         problems = _differences(_open(expected), _open(line))
-        problems += [*_spots(scene, view, line), *_lids(scene, observations, view, line)]
+        problems += [*_spots(scene, view, line), *_lids(scene, view, line)]
         return Again(tuple(problems), _limbus(scene, view))
 
     def remember(self, lines: Mapping[int, dict[str, Any]]) -> None:
@@ -212,7 +212,7 @@ class SceneTruth:
         (own,) = found.take([row]).records()
         expected = image_line(scene, own, view.window, known_labels(scene, found, view))
         problems = [*_differences(_open(expected), _open(line)), *_spots(scene, view, line)]
-        problems += _lids(scene, found, view, line)
+        problems += _lids(scene, view, line)
         return Again(tuple(problems), _limbus(scene, view))
 
 
@@ -288,13 +288,18 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
             yield f"computed again: the spot of light {glint['light']} is at {spot}, not at [{x:.3f}, {y:.3f}]"
 
 
-def _lids(scene: Scene, observations: Observations, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
+def lid_landmarks(scene: Scene, view: EyeInWindow) -> dict[str, list[list[float]]] | None:
+    """Compute the landmarks along the lids in px, without an image; None for a bare eye and for a head mesh."""
+    if scene.spec.region is None or scene.spec.region.head is not None:
+        return None
+    margins = lid_margins(scene.spec.region, globe_of(view.eye, view.M, view.t - view.apex_mm))
+    camera = past_lenses(scene.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
+    return lid_margins_px(margins, camera, view.apex_mm)
+
+
+def _lids(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
     """Check the landmarks along the lids; for a head mesh they are unknown and null."""
-    expected = None
-    if scene.spec.region is not None and scene.spec.region.head is None:
-        margins = lid_margins(scene.spec.region, globe_of(view.eye, view.M, view.t - view.apex_mm))
-        camera = past_lenses(scene.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
-        expected = lid_margins_px(margins, camera, view.apex_mm)
+    expected = lid_landmarks(scene, view)
     yield from _summed(differences(expected, line["labels"]["lid_margins_px"], ROUNDED, "labels.lid_margins_px"))
 
 

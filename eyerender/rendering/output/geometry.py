@@ -31,7 +31,7 @@ from ..records.frame import DeviceFrame, aligned_copy
 from ..records.job import RenderJob
 from ..records.recording import recorded
 from ..scene.region import RegionScene
-from .labels import PartLabels, cover_of, part_of
+from .labels import PartLabels, closed_hit, cover_of, part_of
 
 NOTHING, SKIN, UPPER_LID, LOWER_LID, LASHES, BROW, CARUNCLE, RIMS, TEARS = 0, 5, 6, 7, 8, 9, 10, 11, 12
 """Instances in addition to the parts of a mask."""
@@ -128,9 +128,10 @@ def _hits(
     codes: codes of the instances of a region's triangles.
     """
     u, v = pixels.at(dr.arange(mi.UInt32, count))
-    o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
+    u, v = mi.Float(u), mi.Float(v)
+    o, d, _ = camera_ray(frame, u, v)
     eye = EyeShape(frame=frame).ray_intersect(o, d)
-    hit = hit_before(frame, o, d, eye.distance, mi.Bool(True))
+    hit = closed_hit(frame, u, v, eye.distance, hit_before(frame, o, d, eye.distance, mi.Bool(True)))
     si = behind(eye, hit, mi.Bool(True))
     amodal = part_of(eye)
     part = instance = dr.select(si.other, cover_of(frame, hit), amodal)

@@ -25,6 +25,7 @@ from ..transport.directlight import direct_light, lamp_blocked
 
 _HIGHLIGHT = 0.5  # share of the scattered light
 _ACROSS = 3  # sample points of a pixel across and down
+_BESIDE_PX = (0.011, 0.007)  # wider than the gap between triangles in single precision, narrower than anything to see
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,18 +65,49 @@ def part_labels(bound: BoundFrame, window: Window) -> Callable[[], PartLabels]:
 def _parts(frame: DeviceFrame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi.UInt8]:
     """Return the parts at the pixels' centres, with and without occluders."""
     u, v = pixels.at(dr.arange(mi.UInt32, count))
-    o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
+    u, v = mi.Float(u), mi.Float(v)
+    o, d, _ = camera_ray(frame, u, v)
     eye = EyeShape(frame=frame).ray_intersect(o, d)
     amodal = part_of(eye)
     region = frame.region
     named = frame.structure.obstacles if region is None else bool(region.spectacles or region.obstacles)
     if named:
-        hit = hit_before(frame, o, d, eye.distance, mi.Bool(True))
+        hit = closed_hit(frame, u, v, eye.distance, hit_before(frame, o, d, eye.distance, mi.Bool(True)))
         part = dr.select(hit.is_valid(), cover_of(frame, hit), amodal)
     else:
-        part = dr.select(hidden(frame, eye, o, d), mi.UInt8(BACKGROUND), amodal)
+        covered = hidden(frame, eye, o, d)
+        covered |= _hit_beside(frame, u, v, eye.distance, eye.globe & ~covered).is_valid()
+        part = dr.select(covered, mi.UInt8(BACKGROUND), amodal)
     dr.eval(amodal, part)
     return part, amodal
+
+
+def closed_hit(frame: DeviceFrame, u: mi.Float, v: mi.Float, nearest: mi.Float, hit: TriangleHit) -> TriangleHit:
+    """Replace misses of the rays of pixels (u, v) that slipped between two triangles by the hits beside them."""
+    beside = _hit_beside(frame, u, v, nearest, ~hit.is_valid())
+    met = beside.is_valid()
+    return TriangleHit(
+        t=dr.select(met, beside.t, hit.t),
+        prim_index=dr.select(met, beside.prim_index, hit.prim_index),
+        prim_uv=dr.select(met, beside.prim_uv, hit.prim_uv),
+    )
+
+
+def _hit_beside(frame: DeviceFrame, u: mi.Float, v: mi.Float, nearest: mi.Float, missed: mi.Bool) -> TriangleHit:
+    """Return the hits of the rays on one side of those that missed everything, where the other side is hit, too.
+
+    Embree's fast intersections leave gaps along the common edges of triangles, through which one ray in a million
+    passes. Such a ray has hits on both sides. At a true edge of a surface, one side has none.
+    """
+    hits = []
+    for side in (1, -1) if frame.structure.obstacles else ():
+        right, down = (dr.opaque(mi.Float, side * shift) for shift in _BESIDE_PX)
+        o, d, _ = camera_ray(frame, u + right, v + down)
+        hits.append(hit_before(frame, o, d, nearest, missed))
+    if not hits:
+        return TriangleHit(t=mi.Float(dr.inf), prim_index=mi.UInt32(0), prim_uv=mi.Point2f(0))
+    met = missed & hits[0].is_valid() & hits[1].is_valid()
+    return TriangleHit(t=dr.select(met, hits[0].t, dr.inf), prim_index=hits[0].prim_index, prim_uv=hits[0].prim_uv)
 
 
 def cover_of(frame: DeviceFrame, hit: TriangleHit) -> mi.UInt8:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -11,7 +13,11 @@ import eyerender as er
 from eyerender.optics.trace import inward_path, trace
 from eyerender.region.anatomy import Lashes, Region
 from eyerender.region.look import Look
+from eyerender.rendering.hits.eyeshape import EyeShape
+from eyerender.rendering.hits.primary import TriangleHit, hit_before
+from eyerender.rendering.integrator.sampling import Pixels, camera_ray
 from eyerender.rendering.output.geometry import BROW, LASHES, LOWER_LID, NOTHING, SKIN, UPPER_LID
+from eyerender.rendering.output.labels import closed_hit
 from eyerender.scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA
 from tests.support.render_rigs import eye_of, head_rig, job_of, remote_rig
 
@@ -144,6 +150,25 @@ def test_depth_of_the_skin_is_that_of_its_triangles(renderer):
         wanted = t[hit].min() * float(d[k] @ job.camera.axis)
         at = rows[k], columns[k]
         assert found.depth[at] == pytest.approx(wanted, abs=1e-4 / float(-found.normals[at][2]))
+
+
+def test_rays_that_slip_between_triangles_are_closed(renderer):
+    """Where all rays are said to miss, the rays beside them find the region again, and nothing where there is none."""
+    job = turned("E2", remote_rig(), region=Region())
+    frame = renderer.bind(job, lit=False)[0].frame.bare()
+    _, _, width, height = job.window
+    u, v = (mi.Float(x) for x in Pixels.of(job.window).at(dr.arange(mi.UInt32, width * height)))
+    o, d, _ = camera_ray(frame, u, v)
+    nearest = EyeShape(frame=frame).ray_intersect(o, d).distance
+    hit = hit_before(frame, o, d, nearest, mi.Bool(True))
+    missed = TriangleHit(t=dr.full(mi.Float, dr.inf, width * height), prim_index=hit.prim_index, prim_uv=hit.prim_uv)
+    found = closed_hit(frame, u, v, nearest, missed)
+    there, closed = hit.is_valid().numpy(), found.is_valid().numpy()
+    assert 0.2 < there.mean() < 0.9
+    assert np.mean(there != closed) < 2e-3  # edges within a hundredth of a pixel
+    assert not closed[~there].any()
+    apart = np.abs(hit.t.numpy() - found.t.numpy())[there & closed]
+    assert np.quantile(apart, 0.99) < 0.1  # mm
 
 
 def test_geometry_changes_no_pixel_and_hides_behind_a_frame(renderer):

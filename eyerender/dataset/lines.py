@@ -1,0 +1,104 @@
+"""Lines of the shards of a finished dataset, which stand in metadata.jsonl alone.
+
+A shard in the making has its own file of lines. The assembled metadata.jsonl holds the lines of all shards, so their
+files are then removed (`drop_lines`), and before a run changes the dataset they are written again (`restore_lines`).
+done.json keeps the checksum of a shard's file, which tells whether metadata.jsonl still holds what was made.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..base.errors import WRONG, InputError
+from ..base.storage.files import opened, parse_json, remove_file, written
+from ..base.storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
+from ..folders.imagefolder import LINES, METADATA, SHARDS, finished, shard_name
+
+
+@dataclass(frozen=True, slots=True)
+class ShardLines:
+    """Where the lines of each shard stand in a metadata.jsonl.
+
+    Attributes:
+        path: the file.
+        places: shard -> sample, first byte and length of each line, in the order of the shard's own file.
+        strays: number, from 1, of each line that names no image of a shard.
+    """
+
+    path: Path
+    places: dict[int, list[tuple[int, int, int]]]
+    strays: list[int]
+
+    @classmethod
+    def index(cls, folder: Path) -> ShardLines:
+        """Index the lines of a dataset; of an unreadable file, there are none."""
+        found = cls(folder / METADATA, {}, [])
+        with suppress(InputError, OSError), opened(found.path, limit=MAX_BYTES, follow=False) as file:
+            start, number = 0, 0
+            while text := file.readline(MAX_LINE_BYTES):
+                number += 1
+                try:
+                    line = parse_json(text)
+                    kind, shard, _ = line["file_name"].split("/")
+                    if kind != "images" or shard_name(int(shard)) != shard:
+                        raise ValueError
+                    found.places.setdefault(int(shard), []).append((int(line["sample"]), start, len(text)))
+                except (InputError, *WRONG):
+                    found.strays.append(number)
+                start += len(text)
+        for places in found.places.values():
+            places.sort()
+        return found
+
+    def of(self, shard: int) -> Iterator[bytes]:
+        """Yield the lines of a shard, as its own file holds them.
+
+        Raises:
+            InputError: metadata.jsonl cannot be read.
+        """
+        with opened(self.path, limit=MAX_BYTES, follow=False) as file:
+            for _, start, length in self.places.get(shard, ()):
+                file.seek(start)
+                yield file.read(length)
+
+    def checksum(self, shard: int) -> str:
+        """Return the SHA-256 of a shard's lines; raises like `of`."""
+        found = hashlib.sha256()
+        for text in self.of(shard):
+            found.update(text)
+        return found.hexdigest()
+
+
+def lines_file(folder: Path, shard: int) -> Path:
+    """Return the path of a shard's own file of lines."""
+    return folder / SHARDS / shard_name(shard) / LINES
+
+
+def drop_lines(folder: Path, shards: Iterable[int]) -> None:
+    """Remove the shards' own files of lines, all of which metadata.jsonl holds; the caller has the final lock.
+
+    Raises:
+        OSError: a file cannot be removed.
+    """
+    for shard in shards:
+        remove_file(lines_file(folder, shard))
+
+
+def restore_lines(folder: Path) -> None:
+    """Write the files of lines that finished shards lack from metadata.jsonl; the caller has the final lock.
+
+    Raises:
+        OSError: the disk is full or not writable.
+        EyerenderError: the same.
+    """
+    lacking = [shard for shard in sorted(finished(folder)) if not os.path.lexists(lines_file(folder, shard))]
+    if lacking and (folder / METADATA).is_file():
+        found = ShardLines.index(folder)
+        for shard in lacking:
+            with written(lines_file(folder, shard)) as file:
+                file.writelines(found.of(shard))
