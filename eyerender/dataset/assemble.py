@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from ..base.errors import WRONG, EyerenderError, InputError
 from ..base.progress import Progress, notify
-from ..base.storage.files import MAX_FILE_BYTES, opened, read_json, remove_parts, write_json, write_text, written
+from ..base.storage.files import (
+    MAX_FILE_BYTES,
+    opened,
+    read_json,
+    remove_file,
+    remove_parts,
+    write_json,
+    write_text,
+    written,
+)
 from ..base.storage.jsonlines import MAX_BYTES
 from ..folders.imagefolder import (
     CONVENTIONS,
@@ -35,7 +44,7 @@ from ..folders.packed import INDEX, TAR
 from .card import data_card
 from .croissant import CROISSANT, croissant
 from .done import FILES, PACKED, checksum, compare_sums, is_sums, layout_of, read_done, run_versions, sum_of
-from .lines import drop_lines
+from .lines import lines_file
 from .packing import counts_of
 from .plan import Plan
 from .shard import verify
@@ -89,8 +98,8 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
         "checksums": {name: sum_of(folder / name) for name in (table.layout.table, FAILURES)},
     }
     write_json(folder / DATASET, dataset)
-    if not plan.spec.is_packed:
-        drop_lines(folder, plan.spec.shards)
+    for shard in () if plan.spec.is_packed else plan.spec.shards:
+        remove_file(lines_file(folder, shard))
     return found
 
 

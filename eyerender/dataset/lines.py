@@ -1,21 +1,20 @@
 """Lines of the shards of a finished dataset, which stand in metadata.jsonl alone.
 
 A shard in the making has its own file of lines. The assembled metadata.jsonl holds the lines of all shards, so their
-files are then removed (`drop_lines`), and before a run changes the dataset they are written again (`restore_lines`).
+files are then removed (`assemble`), and before a run changes the dataset they are written again (`restore_lines`).
 done.json keeps the checksum of a shard's file, which tells whether metadata.jsonl still holds what was made.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..base.errors import WRONG, InputError
-from ..base.storage.files import opened, parse_json, remove_file, written
+from ..base.storage.files import opened, parse_json, written
 from ..base.storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
 from ..folders.imagefolder import LINES, METADATA, SHARDS, finished, shard_name
 
@@ -27,29 +26,22 @@ class ShardLines:
     Attributes:
         path: the file.
         places: shard -> sample, first byte and length of each line, in the order of the shard's own file.
-        strays: number, from 1, of each line that names no image of a shard.
     """
 
     path: Path
     places: dict[int, list[tuple[int, int, int]]]
-    strays: list[int]
 
     @classmethod
     def index(cls, folder: Path) -> ShardLines:
-        """Index the lines of a dataset; of an unreadable file, there are none."""
-        found = cls(folder / METADATA, {}, [])
+        """Index the lines of a dataset that name an image of a shard; of an unreadable file, there are none."""
+        found = cls(folder / METADATA, {})
         with suppress(InputError, OSError), opened(found.path, limit=MAX_BYTES, follow=False) as file:
-            start, number = 0, 0
+            start = 0
             while text := file.readline(MAX_LINE_BYTES):
-                number += 1
-                try:
+                with suppress(InputError, *WRONG):
                     line = parse_json(text)
-                    kind, shard, _ = line["file_name"].split("/")
-                    if kind != "images" or shard_name(int(shard)) != shard:
-                        raise ValueError
-                    found.places.setdefault(int(shard), []).append((int(line["sample"]), start, len(text)))
-                except (InputError, *WRONG):
-                    found.strays.append(number)
+                    shard = int(line["file_name"].split("/")[1])
+                    found.places.setdefault(shard, []).append((int(line["sample"]), start, len(text)))
                 start += len(text)
         for places in found.places.values():
             places.sort()
@@ -66,27 +58,10 @@ class ShardLines:
                 file.seek(start)
                 yield file.read(length)
 
-    def checksum(self, shard: int) -> str:
-        """Return the SHA-256 of a shard's lines; raises like `of`."""
-        found = hashlib.sha256()
-        for text in self.of(shard):
-            found.update(text)
-        return found.hexdigest()
-
 
 def lines_file(folder: Path, shard: int) -> Path:
     """Return the path of a shard's own file of lines."""
     return folder / SHARDS / shard_name(shard) / LINES
-
-
-def drop_lines(folder: Path, shards: Iterable[int]) -> None:
-    """Remove the shards' own files of lines, all of which metadata.jsonl holds; the caller has the final lock.
-
-    Raises:
-        OSError: a file cannot be removed.
-    """
-    for shard in shards:
-        remove_file(lines_file(folder, shard))
 
 
 def restore_lines(folder: Path) -> None:

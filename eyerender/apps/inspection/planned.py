@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,16 +41,8 @@ def dependences_of(contents: Contents) -> list[Dependence] | None:
     return dependences(numbers, contents.subjects, may_depend(ordered))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedDraws:
-    """Draws of the samples of a plan.
-
-    Attributes:
-        path: the spec.
-        images: number of samples of the plan.
-        read: number of samples that were drawn.
-        splits, distributions, dependences: as of an `Inspection`.
-    """
+class PlannedDraws(NamedTuple):
+    """Draws of `read` of the `images` samples of a plan; the rest is as of an `Inspection`."""
 
     path: str
     images: int

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import eyerender as er
 from eyerender.optics.trace import inward_path, trace
@@ -166,8 +167,13 @@ def test_rays_that_slip_between_triangles_are_closed(renderer):
     there, closed = hit.is_valid().numpy(), found.is_valid().numpy()
     assert 0.2 < there.mean() < 0.9
     assert np.mean(there != closed) < 2e-3  # edges within a hundredth of a pixel
-    assert not closed[~there].any()
-    apart = np.abs(hit.t.numpy() - found.t.numpy())[there & closed]
+    # What they find in addition are gaps: single pixels amid the region, such as (123, 42).
+    there, closed = there.reshape(height, width), closed.reshape(height, width)
+    around = ndimage.convolve(there.astype(int), np.ones((3, 3)), mode="nearest")
+    assert (around[closed & ~there] == 8).all()
+    assert np.count_nonzero(closed & ~there) <= 2
+    both = (there & closed).ravel()
+    apart = np.abs(hit.t.numpy()[both] - found.t.numpy()[both])
     assert np.quantile(apart, 0.99) < 0.1  # mm
 
 
