@@ -141,11 +141,14 @@ def preview(
         planned: Draw the outlines of pupil, iris and lids and the glints of a dataset's samples, without rendering.
     """
     from ..dataset.sheet import preview as render
+    from ..dataset.sheet import preview_outlines
 
     heed = Heed(strict)
-    how: dict[str, Any] = {"backend": backend, "threads": threads, "planned": planned}
     with progress("drawing" if planned else "rendering") as steps:
-        render(spec, output, eye=eye, seed=seed, progress=steps, warn=heed, **how)
+        if planned:
+            preview_outlines(spec, output, eye=eye, seed=seed, progress=steps, warn=heed)
+        else:
+            render(spec, output, eye=eye, seed=seed, backend=backend, threads=threads, progress=steps, warn=heed)
     print(output)
     return 0
 

@@ -41,7 +41,6 @@ def preview(
     seed: int | None = None,
     backend: BackendChoice = "auto",
     threads: int | None = None,
-    planned: bool = False,
     progress: Progress | None = None,
     warn: Warn | None = None,
 ) -> int:
@@ -56,7 +55,6 @@ def preview(
         seed: replaces the seed of a file.
         backend: the render backend.
         threads: total number of processor threads; by default all.
-        planned: draw the outlines of pupil, iris and lids and the glints of a dataset's samples instead of rendering.
         progress: called with (images done, images in all, "images").
         warn: called with warnings about the scene or spec before anything is rendered, and about saturated images
             before the file is written; if it raises, nothing is written.
@@ -65,22 +63,14 @@ def preview(
         The number of images on the sheet.
 
     Raises:
-        InputError: the suffix is not that of an image format, a sample of the spec cannot be made, or `planned` is
-            given with a scene.
+        InputError: the suffix is not that of an image format, or no sample of the spec can be made.
         EyerenderError: the file cannot be written.
     """
-    path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(path))
+    path = _checked(path)
     what = _found(given, eye, seed)
     if warn is not None:
         warn(what.warnings())
-    if planned and not isinstance(what, Plan):
-        raise InputError("takes a dataset spec, not a scene", source="--planned")
-    if isinstance(what, Plan):
-        maker = _planned(what) if planned else _of_plan(what, backend, threads)
-    else:
-        maker = _of_scene(what, backend, threads)
+    maker = _of_plan(what, backend, threads) if isinstance(what, Plan) else _of_scene(what, backend, threads)
     tiles: list[Tile] = []
     saturated = 0
     for total, tile, is_white in maker:
@@ -89,9 +79,51 @@ def preview(
         notify(progress, len(tiles), total, "images")
     if warn is not None:
         warn(saturation_warnings(saturated, len(tiles), what.source))
+    _write(path, tiles)
+    return len(tiles)
+
+
+def preview_outlines(
+    given: str | Path | DatasetSpec | Plan,
+    path: str | Path,
+    *,
+    eye: str | None = None,
+    seed: int | None = None,
+    progress: Progress | None = None,
+    warn: Warn | None = None,
+) -> int:
+    """Draw the outlines of pupil, iris and lids and the glints of up to sixteen samples, without rendering.
+
+    The arguments, and what is returned and raised, are as for `preview`; a scene is refused.
+    """
+    path = _checked(path)
+    plan = _found(given, eye, seed)
+    if not isinstance(plan, Plan):
+        raise InputError("takes a dataset spec, not a scene", source="--planned")
+    if warn is not None:
+        warn(plan.warnings())
+    tiles, chosen, frames = list[Tile](), plan.spread(TILES), frames_of(plan)
+    for index in chosen:
+        found = realise(plan, index, frames)
+        if found.sample is None or found.frames is None or found.observations is None:
+            raise InputError(f"sample {index} cannot be made: {found.rejections[-1].reason}", source=plan.source)
+        caption = f"{found.sample.split} sample {index} subject {found.sample.turn.subject}"
+        tiles.append((outlines(found.frames, found.observations), caption))
+        notify(progress, len(tiles), len(chosen), "samples")
+    _write(path, tiles)
+    return len(tiles)
+
+
+def _checked(path: str | Path) -> Path:
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"must end with one of {', '.join(FORMATS)}", source=str(path))
+    return path
+
+
+def _write(path: Path, tiles: list[Tile]) -> None:
     with written(path) as file:
         contact_sheet(tiles).save(file, format=FORMATS[path.suffix.lower()])
-    return len(tiles)
 
 
 def _found(given: str | Path | DatasetSpec | Plan | Scene, eye: str | None, seed: int | None) -> Plan | Scene:
@@ -137,16 +169,6 @@ def _of_plan(plan: Plan, backend: BackendChoice, threads: int | None) -> Iterato
         image = made.images[0]
         caption = f"{image.line['split']} sample {made.index} subject {image.line['subject']}"
         yield len(chosen), _tile(image.pictures["images"], image.line, caption), image.saturated
-
-
-def _planned(plan: Plan) -> Iterator[tuple[int, Tile, bool]]:
-    frames, chosen = frames_of(plan), plan.spread(TILES)
-    for index in chosen:
-        found = realise(plan, index, frames)
-        if found.sample is None or found.frames is None or found.observations is None:
-            raise InputError(f"sample {index} cannot be made: {found.rejections[-1].reason}", source=plan.source)
-        caption = f"{found.sample.split} sample {index} subject {found.sample.turn.subject}"
-        yield len(chosen), (outlines(found.frames, found.observations), caption), False
 
 
 def outlines(frames: Frames, observations: Observations) -> Bytes:

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -262,7 +263,7 @@ def test_samples_given_up_are_recorded(tmp_path):
             "shard_size": 2,
         }
     )
-    warnings = []
+    warnings: list[Any] = []
     done = make(tmp_path / "some", made, warn=warnings.extend)
     assert done["statistics"]["samples_given_up"] == 2
     assert done["statistics"]["subjects_left_out"] == 0

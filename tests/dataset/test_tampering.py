@@ -357,7 +357,7 @@ def test_deep_computes_every_line_again(copy, monkeypatch):
         if 13 in lines:
             focal_length(lines[13])
 
-    tamper(copy, change, metadata=True, shards=True)
+    tamper(copy, change, shards=True)
     monkeypatch.setattr("eyerender.dataset.validate.SAMPLE", 2)
     assert validate(copy, quick=True)["recomputed"] == 2
     report = validate(copy, quick=True, deep=True)
