@@ -84,7 +84,7 @@ def preview(
 
 
 def preview_outlines(
-    given: str | Path | DatasetSpec | Plan,
+    given: str | Path | DatasetSpec | Plan | Scene,
     path: str | Path,
     *,
     eye: str | None = None,

@@ -142,7 +142,7 @@ class ImageEntry:
         if self.line.get(key) is None:
             return None
         if self.members is not None:
-            shard = self.source.parent.relative_to(self.folder).as_posix()
+            shard = "/".join(str(self.source).split("/")[-3:-1])
             where = self._where(f"{MEMBERS}.{key}")
             return read_member(self.folder, shard, self.members.get(key), source=str(self.source), path=where)
         path = self.file(key)
@@ -259,7 +259,7 @@ class ImageEntry:
         data = self.data(key)
         if data is None:
             return None
-        (width, height), source = self.window[2:], str(self.folder / self.line[key])
+        (width, height), source = self.window[2:], f"{self.folder}/{self.line[key]}"
         if key in ARRAY_KEYS:
             channels = ARRAY_KEYS[key]
             return array_of(data, (height, width, channels) if channels else (height, width), source)
@@ -561,7 +561,7 @@ def _check_line(line: dict[str, Any], source: str, where: str, *, brief: bool) -
         refuse("schema", f"is {shown(line.get('schema'))}; this version reads {IMAGE_SCHEMA!r}")
     for key in FILE_KEYS:
         name = line.get(key)
-        if not is_plain(name) and (name is not None or key == "file_name"):
+        if (name is not None or key == "file_name") and not is_plain(name):
             refuse(key, f"must be a path inside the folder, not {shown(name)}")
     window = line.get("window_px")
     for key in ("x0", "y0", "width", "height"):

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 from ..base.arrays import Ints
 from ..base.errors import WRONG, InputError
 from ..base.storage.arrays import mapped_array
-from ..base.storage.files import inside, opened, parse_json
+from ..base.storage.files import inside, opened, parse_json, read_slice
 from ..base.storage.jsonlines import MAX_LINE_BYTES
 from .imagefile import MAX_IMAGE_BYTES
 
@@ -261,11 +260,10 @@ def read_member(folder: Path, shard: str, place: object, *, source: str, path: s
     first, size = place
     if size > MAX_IMAGE_BYTES:
         raise InputError(f"is too large (at most {MAX_IMAGE_BYTES} bytes are read)", source=source, path=path)
-    if first + size > os.path.getsize(tar):
+    data, state = read_slice(tar, first, size) if first < 2**60 else (b"", None)
+    if state is None or first + size > state.st_size:
         raise InputError("lies beyond the end of the tar", source=source, path=path)
-    with opened(tar, limit=2**50, follow=False) as file:
-        file.seek(first)
-        return file.read(size)
+    return data
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,5 +317,5 @@ class PackedLines:
         """
         for at in rows:
             own = self.rows[at]
-            path = self.folder / "shards" / f"{int(own['shard']):05d}" / LINES_GZ
+            path = Path(f"{self.folder}/shards/{int(own['shard']):05d}/{LINES_GZ}")
             yield path, int(own["row"]) + 1, read_line(path, int(own["row"]), int(own["block"]), brief=bool(before))

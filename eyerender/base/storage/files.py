@@ -280,11 +280,32 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
     Raises:
         InputError: the file is missing, not regular (a pipe, a device, a folder), too large, or not readable.
     """
-    with open(_regular(path, os.O_RDONLY, follow), "rb") as file:
-        size = os.fstat(file.fileno()).st_size
+    handle, state = _regular(path, os.O_RDONLY, follow)
+    size = state.st_size
+    with open(handle, "rb") as file:
         if size > limit:
             raise InputError(f"is too large ({_size(size)}; at most {_size(limit)} is read)", source=str(path))
         yield file
+
+
+def read_slice(path: str | Path, start: int, length: int) -> tuple[bytes, os.stat_result]:
+    """Read `length` bytes of a regular file, not a link, from `start` on; fewer beyond its end.
+
+    One slice takes half the system calls of `opened`, on which reading small pictures spends much of its time.
+
+    Returns:
+        The bytes, and the state of the file.
+
+    Raises:
+        InputError: as for `opened`.
+    """
+    handle, state = _regular(path, os.O_RDONLY, follow=False)
+    try:
+        return os.pread(handle, length, start), state
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", source=str(path)) from None
+    finally:
+        os.close(handle)
 
 
 def appended(path: str | Path) -> BufferedRandom:
@@ -294,11 +315,11 @@ def appended(path: str | Path) -> BufferedRandom:
         InputError: the path is a link, or something else than a file.
         OSError: the disk is full or not writable.
     """
-    return open(_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False), "ab+")
+    return open(_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False)[0], "ab+")
 
 
-def _regular(path: str | Path, flags: int, follow: bool) -> int:
-    """Open a regular file and return its handle; raises `InputError` like `opened`."""
+def _regular(path: str | Path, flags: int, follow: bool) -> tuple[int, os.stat_result]:
+    """Open a regular file and return its handle and state; raises `InputError` like `opened`."""
     source = str(path)
     try:
         # Opening a pipe for reading would wait for a writer.
@@ -310,24 +331,29 @@ def _regular(path: str | Path, flags: int, follow: bool) -> int:
         raise InputError(_why_unreadable(path, error), source=source) from None
     except ValueError:
         raise InputError("is not a valid file name", source=source) from None
-    mode = os.fstat(handle).st_mode
-    if not stat.S_ISREG(mode):
+    state = os.fstat(handle)
+    if not stat.S_ISREG(state.st_mode):
         os.close(handle)
-        raise InputError(f"is {_kind(mode)}, not a file", source=source)
-    return handle
+        raise InputError(f"is {_kind(state.st_mode)}, not a file", source=source)
+    return handle, state
 
 
 def read_bytes(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> bytes:
     """Read a regular file; raises `InputError` like `opened`."""
     source = str(path)
-    with opened(path, limit=limit, follow=follow) as file:
-        try:
-            size = os.fstat(file.fileno()).st_size
-            data = file.read(size + 1)  # Python allocates memory for everything that it is asked to read
-            if len(data) > size:  # the file has grown
-                data += file.read(limit + 1 - len(data))
-        except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror or error})", source=source) from None
+    handle, state = _regular(path, os.O_RDONLY, follow)
+    size = state.st_size
+    try:
+        if size > limit:
+            raise InputError(f"is too large ({_size(size)}; at most {_size(limit)} is read)", source=source)
+        data = os.read(handle, size + 1)  # Python allocates memory for everything that it is asked to read
+        # A signal ends a read early, and a file may have grown.
+        while len(data) != size and len(data) <= limit and (more := os.read(handle, limit + 1 - len(data))):
+            data += more
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", source=source) from None
+    finally:
+        os.close(handle)
     if len(data) > limit:
         raise InputError(f"is too large (at most {_size(limit)} is read)", source=source)
     return data

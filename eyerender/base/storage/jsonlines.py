@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import Ints
 from ..errors import InputError
-from .files import opened, parse_json
+from .files import opened, parse_json, read_slice
 
 # A line of metadata takes about 10 KB; one with a long list of targets takes more.
 MAX_LINE_BYTES = 4 * 2**20
@@ -75,23 +75,34 @@ class JsonLines:
         Raises:
             InputError: a line is not a JSON object, or the file has changed since it was indexed.
         """
-        if not len(rows):
-            return
         source = str(self.path)
-        with opened(self.path, limit=MAX_BYTES, follow=False) as file:
-            if _state(file) != self.state:
-                raise InputError("has changed while it was read", source=source)
-            for row in rows:
-                start, end = int(self.starts[row]), int(self.starts[row + 1])
-                if file.tell() != start:
-                    file.seek(start)
-                where = f"line {row + 1}"
-                text = file.read(end - start)
-                head, found, _ = text.partition(b', "' + before.encode() + b'": ')
-                value = parse_json(head + b"}" if before and found else text, source=source, path=where)
-                if not isinstance(value, dict):
-                    raise InputError("must be a JSON object", source=source, path=where)
-                yield value
+        for row, text in zip(rows, self._texts(rows), strict=False):
+            where = f"line {row + 1}"
+            head, found, _ = text.partition(b', "' + before.encode() + b'": ')
+            value = parse_json(head + b"}" if before and found else text, source=source, path=where)
+            if not isinstance(value, dict):
+                raise InputError("must be a JSON object", source=source, path=where)
+            yield value
+
+    def _texts(self, rows: range) -> Iterator[bytes]:
+        """Read the texts of some lines."""
+        if len(rows) == 1:
+            start, end = (int(at) for at in self.starts[rows[0] : rows[0] + 2])
+            text, state = read_slice(self.path, start, end - start)
+            self._check((state.st_ino, state.st_size, state.st_mtime_ns))
+            yield text
+        elif len(rows):
+            with opened(self.path, limit=MAX_BYTES, follow=False) as file:
+                self._check(_state(file))
+                for row in rows:
+                    start, end = int(self.starts[row]), int(self.starts[row + 1])
+                    if file.tell() != start:
+                        file.seek(start)
+                    yield file.read(end - start)
+
+    def _check(self, state: tuple[int, int, int]) -> None:
+        if state != self.state:
+            raise InputError("has changed while it was read", source=str(self.path))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
