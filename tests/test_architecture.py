@@ -19,7 +19,7 @@ PACKAGE = Path(eyerender.__file__).resolve().parent
 
 # Lower floors know nothing of higher ones; packages on one floor do not import each other.
 FLOORS = {
-    "base": 2692,
+    "base": 0,
     "backends": 1,
     "optics": 1,
     "eye": 2,
@@ -27,18 +27,18 @@ FLOORS = {
     "rig": 2,
     "population": 3,
     "scene": 3,
-    "folders": 1865,
+    "folders": 4,
     "analytic": 5,
-    "rendering": 12872,
+    "rendering": 5,
     "extraction": 5,
     "design": 6,
     "gaze": 7,
     "imaging": 8,
     "report": 9,
-    "dataset": 10418,
+    "dataset": 9,
     "torch": 10,
-    "apps": 17005,
-    "cli": 2701,
+    "apps": 10,
+    "cli": 11,
     "__init__": 12,
     "__main__": 12,
 }

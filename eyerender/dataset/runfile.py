@@ -20,6 +20,7 @@ from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .done import FILES, PACKED, read_done, run_versions
 from .environment import environment
+from .lines import restore_lines
 from .plan import Plan
 from .rounding import rounding
 from .spec import DatasetSpec
@@ -81,6 +82,7 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
     if found is not None:
         _refuse_another(folder, found, mine, plan.files)
         if _count_of(found) != _count_of(mine):
+            restore_lines(folder)  # without dataset.json they are read from there
             remove_file(folder / DATASET)  # it belongs to another number of samples
             # Shards that were made for another number of samples are looked for until the dataset is assembled.
             write_json(path, {**mine, "resized": True})
