@@ -10,7 +10,7 @@ from .figures import PICTURE, PUPIL_VISIBLE, SATURATED
 from .reading import Contents
 
 _EACH = 5
-# Figure -> its column, and +1 if high numbers are bad, -1 if low ones are. Pupils out of sight have no figure.
+# Figure -> its column, and +1 if high numbers are bad, else -1. Pupils all in or out of sight have no figure.
 _FIGURES = {
     "most saturated": (SATURATED, 1),
     "darkest": (f"{PICTURE}mean level", -1),
@@ -32,7 +32,8 @@ def worst_pictures(contents: Contents) -> list[WorstPicture]:
     found: dict[int, WorstPicture] = {}
     for figure, (column, sign) in _FIGURES.items():
         values = contents.columns.get(column, np.zeros(0)).astype(float)
-        values = np.where(values > 0, values, np.nan) if column in (SATURATED, PUPIL_VISIBLE) else values
+        if column in (SATURATED, PUPIL_VISIBLE):
+            values = np.where((values > 0) & (values < 1), values, np.nan)
         order = [at for at in np.argsort(-sign * values, kind="stable").tolist() if np.isfinite(values[at])]
         for at in [at for at in order if at not in found][:_EACH]:
             found[at] = WorstPicture(at, figure, float(values[at]))
