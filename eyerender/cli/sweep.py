@@ -18,6 +18,7 @@ def sweep(
     *,
     output: OutputFolder,
     people: int | None = None,
+    tolerances: Path | None = None,
     workers: int | None = None,
     shard: str | None = None,
     overwrite: Overwrite = False,
@@ -31,6 +32,7 @@ def sweep(
     Args:
         spec: A YAML file that names a scene and has the key `sweep`.
         people: Number of people (default: that of the file).
+        tolerances: A YAML file of tolerances of cameras, LEDs and mirrors, as for `rig`; their cost becomes a goal.
         workers: Number of processes (default: one per processor). Results do not depend on it.
         shard: K/N: evaluate only every N-th layout, starting with the K-th (1 <= K <= N), for array jobs that write to
             one folder.
@@ -38,6 +40,7 @@ def sweep(
     from ..apps.sweeps.run import REPORT, SweepRun, run_sweep
     from ..apps.sweeps.spec import SweepSpec
     from ..base.errors import InputError
+    from ..design.tolerances import Tolerances
 
     part = part_of(shard)
     if overwrite and shard is not None:
@@ -47,11 +50,12 @@ def sweep(
     wanted = SweepSpec.load(spec)
     if people is not None:
         wanted = wanted.replaced("--people", {"people": people})
+    allowed = None if tolerances is None else Tolerances.load(tolerances)
     how = SweepRun(workers=workers, part=part, overwrite=overwrite)
     try:
         scene = wanted.base(spec.parent)
         with progress("sweep") as steps:
-            found = run_sweep(wanted, scene, output, how, progress=steps, say=say)
+            found = run_sweep(wanted, scene, output, how, tolerances=allowed, progress=steps, say=say)
     except InputError as error:
         raise error.placed(source=str(spec)) from None
     emit(found, _text(found, output / REPORT), json)

@@ -26,10 +26,12 @@ from numpy.typing import NDArray
 from ..base.errors import InputError, InputWarning
 from ..base.references import is_reference
 from ..base.spec import read_yaml
+from ..design.tolerances import Tolerances, drawn_unit
 from ..eye.catalogue import catalogue_names, load_eye
 from ..eye.spec import EyeSpec
 from ..eye.topography import topography_files
 from ..population.people import PersonChoice, choice_of, chosen_person
+from ..rig.rig import Rig
 from ..scene import Scene
 from ..scene.observation import EYES
 from ..scene.spec import SceneSpec
@@ -45,6 +47,7 @@ from .template import Template, Turn, possible
 RANKED_SUBJECTS = 1_000_000
 # Of a function without a spec, whose number of samples may grow: samples of a block of its plan, and of a shard.
 _PLANNED, _SHARD = 16_000, 16
+_UNIT = 0x75  # of the random numbers of units
 _LOOKED_AT = 16  # samples that `Plan.warnings` checks for probable mistakes
 
 
@@ -349,6 +352,8 @@ class Plan:
         tree.setdefault("name", f"{spec.name} {sample}")
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
+        if spec.tolerances is not None:
+            tree["rig"] = self._unit_of(tree.get("rig"), turn.subject)
         eye, eye_drawn, _ = self._eye_of(tree, turn) if own is None else (own.eye, {}, False)
         if own is None and spec.population is not None and eye:
             tree = _with_optics(tree, self.base)
@@ -360,6 +365,22 @@ class Plan:
             draws={**drawn, **eye_drawn},
             base=self.base if own is None or own.base is None else own.base,
         )
+
+    def _unit_of(self, rig: Any, subject: int) -> dict[str, Any]:
+        """Draw the rig of a subject's unit from the nominal one.
+
+        Raises:
+            InputError: the rig is none, or a tolerance is that of no part.
+        """
+        try:
+            nominal = Rig.from_mapping(rig).resolved(self.base)
+        except InputError as error:
+            raise error.placed(under="rig") from None
+        tolerances = Tolerances.from_mapping({"tolerances": self.spec.to_mapping()["tolerances"]})
+        try:
+            return drawn_unit(nominal, tolerances, (self.spec.seed, subject, _UNIT)).to_mapping()
+        except InputError as error:
+            raise error.placed(source=self.source) from None
 
     def _scene_of(self, turn: Turn) -> tuple[dict[str, Any], dict[str, Any]]:
         variables, variables_drawn = self.variable_template.values(turn)

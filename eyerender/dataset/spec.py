@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from ..base.errors import InputError
 from ..base.spec import FileSpec, Positive, Spec
+from ..design.tolerances import Tolerance, Tolerances
 from ..population.people import PopulationSpec
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scene.spec import DATASET_KIND, NOT_A_DATASET
@@ -135,6 +136,11 @@ class DatasetSpec(FileSpec):
         description="whom the subjects are drawn from: eyes, lids, face and distance of the pupils; what `scene` says "
         "of `look`, `region` and `subject.ipd_mm` stays; default: the eye of the scene",
     )
+    tolerances: Annotated[tuple[Tolerance, ...], Field(min_length=1, max_length=100)] | None = Field(
+        default=None,
+        description="deviations of each subject's unit from the rig of `scene`: a list, or the name of a file of "
+        "tolerances (as for `rig`); labels and `scene_json` state the unit's rig; default: none",
+    )
     labels: LabelsSpec = Field(default=LabelsSpec(), description="labels in addition to those that every image has")
     auto_exposure: Annotated[float, Field(ge=0.01, le=2)] | None = Field(
         default=None,
@@ -185,8 +191,10 @@ class DatasetSpec(FileSpec):
 
     @classmethod
     def gathered(cls, data: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """Merge the spec that a file extends, and the rows of its tables, into its mapping."""
+        """Merge the spec that a file extends, the rows of its tables, and a file of tolerances into its mapping."""
         found: dict[str, Any] = with_tables(extended(data, find_dataset, folder), folder)
+        if isinstance(file := found.get("tolerances"), str):
+            found["tolerances"] = Tolerances.load(folder / file).to_mapping()["tolerances"]
         return found
 
     @classmethod

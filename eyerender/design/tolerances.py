@@ -20,14 +20,16 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..base.arrays import ArrayValue, Bools, Floats, Ints, frozen
+from ..base.arrays import ArrayValue, Bools, Floats, Ints, finite_or_none, frozen
 from ..base.errors import InputError
 from ..base.spec import FileSpec, Positive, Spec
 from ..rig.camera import Camera, Mirror, PinholeCamera
-from ..rig.rig import RigGeometry
+from ..rig.distortion import distortion_data
+from ..rig.rig import Rig, RigGeometry
 from ..scene import Scene
+from ..scene.observation import EYES
 from ..scene.spec import SceneSpec
-from .crowd import OUTLINE
+from .crowd import OUTLINE, users_of
 from .information import information_of_views, whitened_rows
 from .noise import FeatureNoise
 from .people import CALIBRATION_CELLS, GRID, POINTS, RigPopulation, cases_of, learned, seen_features
@@ -35,8 +37,9 @@ from .unknowns import Unknowns
 from .varied import FeatureSlopes, Views, gaze_slopes, images_of
 
 _STEP = 0.1  # of a standard deviation, for derivatives by central differences
-UNITS = 200
-"""Number of drawn units."""
+UNITS, UNIT_PEOPLE = 200, 20
+"""Number of drawn units, and of people before them."""
+_LEAST_POWER = 1e-3  # of the nominal one, so that a drawn LED is never off
 
 _AXES = {
     ("camera", "rotation_deg"): 3,
@@ -114,6 +117,90 @@ class UnitErrors(ArrayValue):
         return np.asarray(sizes.reshape(-1, GRID * GRID))
 
 
+def of_this_eye(scene: Scene, tolerances: Tolerances) -> Tolerances:
+    """Count the parts of tolerances, whose numbers are those of the whole rig, among the parts that the first eye has.
+
+    Raises:
+        InputError: a part does not exist, or serves the other eye alone.
+    """
+    side, rig = scene.spec.subject.eyes[0], scene.rig
+    cameras = [k for k, camera in enumerate(rig.cameras) if camera.sees(side)]
+    lights = list(rig.lights_of(EYES.index(side)))
+    out = []
+    for k, one in enumerate(tolerances.tolerances):
+        count, kept = (len(rig.lights), lights) if one.part == "led" else (len(rig.cameras), cameras)
+        if one.number != "all" and one.number not in kept:
+            other = f"{one.part} {one.number} serves the other eye, and the report is about the {side} one"
+            reason = f"the rig has no {one.part} {one.number}" if one.number >= count else other
+            raise InputError(reason, path=f"tolerances.{k}.number")
+        number = one.number if one.number == "all" else kept.index(one.number)
+        out.append(one.model_copy(update={"number": number}))
+    own = tolerances.model_copy(update={"tolerances": tuple(out)})
+    list(axes_of(scene.of_first_eye(), own))  # refuses mirrors that do not exist
+    return own
+
+
+def tolerated(
+    survey: RigPopulation, tolerances: Tolerances, own: Tolerances, noise: FeatureNoise, people: int
+) -> dict[str, Any]:
+    """Compute what each tolerance costs, and the errors of drawn units; `own` counts the parts of this eye's rig.
+
+    The estimator weights features by `noise`.
+    """
+    found = unit_errors(survey, own, noise, people)
+    rows = tolerances.to_mapping()["tolerances"]
+    costs = found.by_tolerance(len(rows))
+    return {
+        "tolerances": [{**row, "gaze_deg": finite_or_none(cost)} for row, cost in zip(rows, costs, strict=True)],
+        "units": {"people": people, "units": UNITS, **users_of(found.of_units(survey.seed))},
+    }
+
+
+def drawn_unit(rig: Rig, tolerances: Tolerances, seed: Sequence[int]) -> Rig:
+    """Draw a unit: a rig whose parts deviate from the nominal `rig`, whenever the deviations come about.
+
+    Cameras have calibrations, and rings are single LEDs. Deviations are before the rig's mount, and a camera's are
+    along the axes of the camera itself.
+
+    Raises:
+        InputError: a number is not one of the rig's parts.
+    """
+    rng, rig = np.random.default_rng(seed), rig.resolved()
+    cameras, leds = [camera.unmirrored() for camera in rig.cameras], rig.single_leds()
+    specs = list(rig.cameras)
+    for k, one in enumerate(tolerances.tolerances):
+        for number in _numbers(one, k, len(leds), rig.cameras):
+            amounts = one.sd * rng.standard_normal(max(_AXES[one.part, one.quantity], 1))
+            if one.part == "mirror":
+                for axis, amount in enumerate(amounts):
+                    mirror = _moved_mirror(specs[number], one.quantity, axis, float(amount))
+                    specs[number] = specs[number].model_copy(update={"mirror": mirror})
+            elif one.quantity == "power_percent":
+                leds[number]["intensity_mw_sr"] *= max(1.0 + float(amounts[0]) / 100.0, _LEAST_POWER)
+            elif one.part == "led":
+                leds[number]["position_mm"] = (np.asarray(leds[number]["position_mm"]) + amounts).tolist()
+            else:
+                for axis, amount in enumerate(amounts):
+                    cameras[number] = _deviating(cameras[number], one.quantity, axis, float(amount))
+    made = [_calibrated(spec, camera) for spec, camera in zip(specs, cameras, strict=True)]
+    kept = {key: value for key, value in rig.to_mapping().items() if key not in ("cameras", "lights")}
+    return Rig.from_mapping({**kept, "cameras": made, "lights": leds})
+
+
+def _calibrated(spec: Camera, camera: PinholeCamera) -> dict[str, Any]:
+    """Return the mapping of a camera whose pose and lens are those of a numeric one."""
+    replaced = ("position_mm", "look_at_mm", "pan_deg", "tilt_deg", "roll_deg", "focal_length_px", "focal_length_mm",
+                "sensor_mm", "principal_point_px", "distortion", "calibration")  # fmt: skip
+    numbers = {
+        "K": camera.K.tolist(),
+        "R": camera.R.tolist(),
+        "t_mm": camera.t.tolist(),
+        "distortion": distortion_data(camera.distortion),
+        "valid_radius": finite_or_none(camera.reach),
+    }
+    return {**{k: v for k, v in spec.to_mapping().items() if k not in replaced}, "calibration": numbers}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Axis:
     """One axis of one part: the rig with an amount of its deviation, and the cameras that see a difference."""
@@ -147,13 +234,7 @@ def axes_of(scene: Scene, tolerances: Tolerances) -> Iterator[_Axis]:
     """Yield the axes of all tolerances, and the rig moved along each."""
     rig, cameras = scene.rig, scene.spec.rig.cameras
     for k, one in enumerate(tolerances.tolerances):
-        count = len(rig.lights) if one.part == "led" else len(rig.cameras)
-        numbers = range(count) if one.number == "all" else [one.number]
-        if one.part == "mirror":
-            numbers = [n for n in numbers if n < count and cameras[n].mirror is not None]
-        if not len(numbers) or max(numbers) >= count:
-            raise InputError(f"the rig has no such {one.part}", path=f"tolerances.{k}.number")
-        for number in numbers:
+        for number in _numbers(one, k, len(rig.lights), cameras):
             for axis in range(_AXES[one.part, one.quantity]):
                 yield _Axis(
                     tolerance=k,
@@ -162,6 +243,21 @@ def axes_of(scene: Scene, tolerances: Tolerances) -> Iterator[_Axis]:
                     cameras=tuple(range(len(rig.cameras))) if one.part == "led" else (number,),
                     moved=_mover(rig, cameras, one, number, axis),
                 )
+
+
+def _numbers(one: Tolerance, k: int, lights: int, cameras: Sequence[Camera]) -> Sequence[int]:
+    """Return the numbers of the parts of tolerance k.
+
+    Raises:
+        InputError: the rig has no such part.
+    """
+    count = lights if one.part == "led" else len(cameras)
+    numbers: Sequence[int] = range(count) if one.number == "all" else [one.number]
+    if one.part == "mirror":
+        numbers = [n for n in numbers if n < count and cameras[n].mirror is not None]
+    if not len(numbers) or max(numbers) >= count:
+        raise InputError(f"the rig has no such {one.part}", path=f"tolerances.{k}.number")
+    return numbers
 
 
 def _mover(
@@ -200,6 +296,10 @@ def _deviating(camera: PinholeCamera, quantity: str, axis: int, amount: float) -
 
 
 def _mirrored(camera: Camera, quantity: str, axis: int, amount: float) -> PinholeCamera:
+    return camera.model_copy(update={"mirror": _moved_mirror(camera, quantity, axis, amount)}).build()
+
+
+def _moved_mirror(camera: Camera, quantity: str, axis: int, amount: float) -> Mirror:
     """Turn a camera's mirror about an axis in its plane through its point, or move it along its normal (axis 0)."""
     assert camera.mirror is not None
     normal, _ = camera.mirror.plane
@@ -208,8 +308,7 @@ def _mirrored(camera: Camera, quantity: str, axis: int, amount: float) -> Pinhol
         point = point + amount * normal
     else:
         normal = _about(np.linalg.svd(normal[None])[2][1 + axis], amount) @ normal
-    mirror = Mirror(point_mm=tuple(point.tolist()), normal=tuple(normal.tolist()))
-    return camera.model_copy(update={"mirror": mirror}).build()
+    return camera.mirror.model_copy(update={"point_mm": tuple(point.tolist()), "normal": tuple(normal.tolist())})
 
 
 def _about(axis: Floats, angle_deg: float) -> Floats:

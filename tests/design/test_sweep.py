@@ -12,6 +12,10 @@ import pytest
 from eyerender.apps.sweeps.run import GOALS, SweepRun, pareto, run_sweep
 from eyerender.apps.sweeps.spec import SweepSpec, SweptPlaces, layouts_of
 from eyerender.base.errors import InputError
+from eyerender.cli.main import run
+from eyerender.design.eyebox import sharp_depth_mm
+from eyerender.design.tolerances import Tolerances
+from eyerender.rig.defocus import confusion_px
 
 SWEEP: dict[str, Any] = {
     "format": 1,
@@ -86,7 +90,7 @@ def test_the_pareto_front_is_what_no_other_row_beats():
     found = pareto(rows)
 
     def value(row: dict, goal: str) -> float:
-        return float("inf") if row[goal] is None else row[goal]
+        return float("inf") if row[goal] is None else GOALS[goal] * row[goal]
 
     for k, row in enumerate(rows):
         beaten = any(
@@ -105,3 +109,35 @@ def test_sweeps_that_cannot_be_are_refused():
         spec = spec_of(**sweep)
         with pytest.raises(InputError, match=reason):
             layouts_of(spec, spec.base(Path()))
+
+
+def test_a_long_lens_pays_with_depth_and_field_and_tolerances_count(tmp_path):
+    """A longer lens has less noise. It is sharp over less depth, and its picture does not hold the whole eye box."""
+    spec = SweepSpec.from_mapping({
+        "format": 1, "scene": "headset", "people": 1, "sweep": {"cameras": [{"focal_length_px": [720, 2400]}]},
+    })  # fmt: skip
+    scene = spec.base(Path())
+    one = {"part": "camera", "quantity": "rotation_deg", "sd": 0.2, "when": "after"}
+    given = Tolerances.from_mapping({"tolerances": [one]})
+    short, long = run_sweep(spec, scene, tmp_path / "out", SweepRun(workers=1), tolerances=given)["rows"]
+    assert long["noise_deg"] < short["noise_deg"]
+    assert long["sharp_depth_mm"] < short["sharp_depth_mm"]
+    assert long["field"] < 0.9
+    assert short["field"] == 1.0
+    assert 0 < short["units_deg"] < 1
+    assert short["tolerances"][0] == {**one, "number": "all", "gaze_deg": short["tolerances"][0]["gaze_deg"]}
+    with pytest.raises(InputError, match="holds another sweep"):
+        run_sweep(spec, scene, tmp_path / "out", SweepRun(workers=1))
+    file = tmp_path / "wrong.yaml"
+    file.write_text("format: 1\ntolerances:\n- {part: led, number: 9, quantity: position_mm, sd: 1, when: after}\n")
+    (tmp_path / "sweep.yaml").write_text(spec.to_yaml())
+    assert run(["sweep", str(tmp_path / "sweep.yaml"), "-o", str(tmp_path / "no"), "--tolerances", str(file)]) == 2
+    assert not (tmp_path / "no").exists()
+
+
+def test_the_sharp_depth_ends_where_the_circle_of_confusion_reaches_the_limit(tmp_path):
+    scene = SweepSpec.from_mapping(SWEEP).base(Path()).with_({"lens.focus_mm": 45.0})
+    found = sharp_depth_mm(scene, 1.0)
+    depth = np.linspace(40.0, 50.0, 100_001)
+    disc = confusion_px(scene.spec.lens, scene.rig.cameras[0], scene.spec.sensor, depth)
+    assert found == pytest.approx(np.ptp(depth[disc <= 1.0]), abs=2e-4)  # two steps of the depth

@@ -32,7 +32,7 @@ from ...design.crowd import (
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, place_of
 from ...design.safety import BOX_MM, NOTE, eye_exposure
-from ...design.tolerances import UNITS, Tolerances, axes_of, unit_errors
+from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import staged
 from ...gaze.estimate import ray_errors_deg
@@ -56,8 +56,6 @@ REPORT, PEOPLE, GAZE, SUMMARY = "report.html", "people.csv", "gaze.csv", "summar
 ESTIMATORS = ("direction-regression", "hennessey", "guestrin-eizenman", "maximum-likelihood")
 NOISE_ONLY = "noise only"
 TRAITS = ("age", "lids open (mm)", "fissure wide (mm)", "pupils apart (mm)")
-UNIT_PEOPLE = 20
-"""People for the errors by tolerances."""
 _TARGET_MM = 1000.0
 _SLIPPING = 4
 
@@ -102,8 +100,6 @@ def run_rig(
     whole, scene = scene, scene.of_first_eye()
     survey = survey_of(scene, population, size, unknowns)
     own = None if tolerances is None else of_this_eye(whole, tolerances)
-    if own is not None:
-        list(axes_of(Scene.of(SceneSpec.from_mapping(survey.scene)), own))  # refuses parts that do not exist
     noise = sensor_noise(scene)
     with staged(output, overwrite=overwrite) as folder:
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
@@ -119,49 +115,13 @@ def run_rig(
         data["slippage"] = _slippage_of(*slipped)
         data |= {"tolerances": None, "units": None}
         if tolerances is not None and own is not None:
-            data |= tolerated(survey, tolerances, own, scene.rig, min(UNIT_PEOPLE, size.people))
+            weights = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=scene.rig)  # those of `MaximumLikelihood`
+            data |= tolerated(survey, tolerances, own, weights, min(UNIT_PEOPLE, size.people))
         write_json(folder / SUMMARY, data)
         _write_people(folder / PEOPLE, found)
         _write_gaze(folder / GAZE, survey, found)
         write_page(folder / REPORT, page_of(scene, survey, found, data))
     return data
-
-
-def of_this_eye(scene: Scene, tolerances: Tolerances) -> Tolerances:
-    """Count the parts of tolerances, whose numbers are those of the whole rig, among the parts that the first eye has.
-
-    Raises:
-        InputError: a part does not exist, or serves the other eye alone.
-    """
-    side, rig = scene.spec.subject.eyes[0], scene.rig
-    cameras = [k for k, camera in enumerate(rig.cameras) if camera.sees(side)]
-    lights = list(rig.lights_of(EYES.index(side)))
-    out = []
-    for k, one in enumerate(tolerances.tolerances):
-        count, kept = (len(rig.lights), lights) if one.part == "led" else (len(rig.cameras), cameras)
-        if one.number != "all" and one.number not in kept:
-            other = f"{one.part} {one.number} serves the other eye, and the report is about the {side} one"
-            reason = f"the rig has no {one.part} {one.number}" if one.number >= count else other
-            raise InputError(reason, path=f"tolerances.{k}.number")
-        number = one.number if one.number == "all" else kept.index(one.number)
-        out.append(one.model_copy(update={"number": number}))
-    return tolerances.model_copy(update={"tolerances": tuple(out)})
-
-
-def tolerated(
-    survey: RigPopulation, tolerances: Tolerances, own: Tolerances, rig: RigGeometry, people: int
-) -> dict[str, Any]:
-    """Compute what each tolerance costs, and the errors of drawn units; `own` counts the parts of this eye's rig.
-
-    The estimator weights features as `MaximumLikelihood` does.
-    """
-    found = unit_errors(survey, own, FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=rig), people)
-    rows = tolerances.to_mapping()["tolerances"]
-    costs = found.by_tolerance(len(rows))
-    return {
-        "tolerances": [{**row, "gaze_deg": finite_or_none(cost)} for row, cost in zip(rows, costs, strict=True)],
-        "units": {"people": people, "units": UNITS, **users_of(found.of_units(survey.seed))},
-    }
 
 
 def survey_of(scene: Scene, population: Population, size: RigSize, unknowns: Unknowns | None = None) -> RigPopulation:

@@ -17,7 +17,7 @@ _LITTLE = 0.05
 
 def write_report(path: Path, data: Mapping[str, Any]) -> None:
     """Write the report page of a sweep."""
-    rows = data["rows"]
+    rows, box = data["rows"], data["eye_box"]
     front = [row for row in rows if row["pareto"]]
     seen = [row for row in front if row["noise_deg"] is not None]
     safe = [row for row in seen if row["cornea_share"] is not None]
@@ -33,8 +33,14 @@ def write_report(path: Path, data: Mapping[str, Any]) -> None:
         _answer(front),
         f"{len(rows)} layouts of the rig of '{data['scene']}', each before the same {data['people']} people in 81 "
         "directions of gaze. Everything follows from ray optics; nothing is rendered.",
-        "A layout is on the Pareto front if no other one is at least as good in noise, dropout, number of LEDs and "
-        "light on the cornea, and better in one of them. The noise counts the sensor alone. What an estimator assumes "
+        "A layout is on the Pareto front if no other one is at least as good in noise, dropout, number of LEDs, "
+        "light on the cornea, sharp depth and field, and better in one of them"
+        + (" (tolerances count too). " if "units_deg" in data["goals"] else ". ")
+        + f"The sharp depth is that with circles of confusion below {box['sharp_px']:g} px. The field is the share of "
+        f"the eye box ({', '.join(f'{half:g}' for half in box['field_mm'])} mm to either side in depth, across and up) "
+        "and of the directions with the whole pupil in a picture. "
+        f"Eyes slip by {box['slippage_mm']:g} mm per axis and {box['relief_mm']:g} mm in depth (standard deviations); "
+        f"pupils are those at {box['luminance_cd_m2']:g} cd/m². The noise counts the sensor alone. What an estimator assumes "
         "wrongly about the eye comes on top.",
     ]
     plots = (
@@ -110,13 +116,26 @@ def _table(front: Sequence[Mapping[str, Any]]) -> Table:
         [str(row["number"]), _values(row["values"]), degrees_text(row["noise_deg"]),
          degrees_text(row["frame_to_frame_deg"]["U95E95"]), f"{100 * row['dropout']:.1f} %", str(row["leds"]),
          "not known" if row["cornea_share"] is None else f"{100 * row['cornea_share']:.2g} %",
-         " ".join(map(str, row["chosen"]))]
+         f"{row['sharp_depth_mm']:.3g} mm", f"{100 * row['field']:.1f} %",
+         "" if row["units_deg"] is None else degrees_text(row["units_deg"]), " ".join(map(str, row["chosen"]))]
         for row in ordered[:_MOST_ROWS]
     ]  # fmt: skip
-    head = ["layout", "what varies", "noise", "U95E95", "dropout", "LEDs", "cornea", "places of LEDs"]
+    head = [
+        "layout",
+        "what varies",
+        "noise",
+        "U95E95",
+        "dropout",
+        "LEDs",
+        "cornea",
+        "sharp",
+        "field",
+        "units, U50E95",
+        "places of LEDs",
+    ]
     more = f" The first {_MOST_ROWS} of {len(front)}; layouts.csv has all." if len(front) > _MOST_ROWS else ""
     caption = f"The Pareto front; noise is the median, the cornea's share is of the limit.{more}"
-    return Table(head, rows, caption, wide=(1, 7))
+    return Table(head, rows, caption, wide=(1, 10))
 
 
 def _values(values: Mapping[str, Any]) -> str:

@@ -27,11 +27,14 @@ from ...base.storage.files import make_folder, read_json, write_json
 from ...base.storage.lock import final_lock, run_lock
 from ...design.choice import choose_lights, noise_of_some
 from ...design.crowd import coverage_of, covered, gaze_of
-from ...design.noise import sensor_noise
+from ...design.noise import FeatureNoise, sensor_noise
+from ...design.eyebox import eye_box_mm, field_share, sharp_depth_mm
 from ...design.people import RigPopulation, figures_of, sites_seen
 from ...design.safety import eye_exposure
+from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import clear, refuse_non_empty
+from ...gaze.likelihood import GLINT_PX, OUTLINE_PX
 from ...scene import Scene
 from ...scene.spec import SceneSpec
 from .page import write_report
@@ -41,8 +44,8 @@ SCHEMA, LAYOUT_SCHEMA = "eyerender/sweep/1", "eyerender/sweep-layout/1"
 MARKER, SUMMARY, TABLE, LAYOUTS, REPORT = "sweep.json", "summary.json", "layouts.csv", "layouts", "report.html"
 CHOOSERS = 12
 """People whose information chooses LEDs."""
-GOALS = ("noise_deg", "dropout", "leds", "cornea_w_m2")
-"""Quantities of which a good layout has little; they define the Pareto front."""
+GOALS = {"noise_deg": 1, "dropout": 1, "leds": 1, "cornea_w_m2": 1, "sharp_depth_mm": -1, "field": -1, "units_deg": 1}
+"""Quantities that define the Pareto front: of those with 1 a good layout has little, of those with -1 much."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +69,7 @@ def run_sweep(
     output: str | Path,
     how: SweepRun = SweepRun(),
     *,
+    tolerances: Tolerances | None = None,
     progress: Progress | None = None,
     say: Say = lambda _text: None,
 ) -> dict[str, Any]:
@@ -76,22 +80,26 @@ def run_sweep(
         scene: the sweep's base scene (`spec.base`).
         output: the folder, which may hold a part of the same sweep.
         how: options of the run.
+        tolerances: deviations of units from each layout; for the first `UNIT_PEOPLE`.
         progress: called with (layouts done, layouts of this run, what).
         say: called with a message for each problem that does not end the run.
 
     Raises:
-        InputError: a layout is impossible, or the folder holds something else.
+        InputError: a layout is impossible, a tolerance is that of no part, or the folder holds something else.
     """
     folder = Path(output)
     layouts = layouts_of(spec, scene)
-    settings = {"schema": SCHEMA, "sweep": _digest(spec, scene), "layouts": len(layouts), "spec": spec.to_mapping()}
+    if tolerances is not None:
+        _check_tolerances(tolerances, layouts)
+    digest = _digest(spec, scene, tolerances)
+    settings = {"schema": SCHEMA, "sweep": digest, "layouts": len(layouts), "spec": spec.to_mapping()}
     _claim(folder, settings, how.overwrite)
     k, n = how.part
     with run_lock(folder, how.part, say):
         mine = [layout for layout in layouts if layout.number % n == k - 1]
         missing = [layout for layout in mine if not _path(folder, layout.number).is_file()]
         done = len(mine) - len(missing)
-        for number, record in _evaluated(spec, missing, how.workers):
+        for number, record in _evaluated(spec, missing, how.workers, tolerances):
             write_json(_path(folder, number), {"schema": LAYOUT_SCHEMA, **record})
             done += 1
             notify(progress, done, len(mine), "layouts")
@@ -106,8 +114,27 @@ def _path(folder: Path, number: int) -> Path:
     return folder / LAYOUTS / f"{number:06d}.json"
 
 
-def _digest(spec: SweepSpec, scene: Scene) -> str:
+def _check_tolerances(tolerances: Tolerances, layouts: Sequence[RigLayout]) -> None:
+    """Check that tolerances name parts of the layouts; an LED that is chosen among places has no fixed number.
+
+    Raises:
+        InputError: naming the tolerance that does not fit.
+    """
+    scene = Scene.of(SceneSpec.from_mapping(layouts[0].scene))
+    try:
+        of_this_eye(scene, tolerances)
+    except InputError as error:
+        raise error.placed(source="--tolerances") from None
+    for k, one in enumerate(tolerances.tolerances):
+        if one.part == "led" and one.number != "all" and layouts[0].lights < len(scene.rig.lights):
+            reason = "LEDs are chosen among places; write all"
+            raise InputError(reason, source="--tolerances", path=f"tolerances.{k}.number")
+
+
+def _digest(spec: SweepSpec, scene: Scene, tolerances: Tolerances | None) -> str:
     content = {"spec": spec.to_mapping(), "scene": scene.located().to_mapping()}
+    if tolerances is not None:
+        content["tolerances"] = tolerances.to_mapping()
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -137,19 +164,20 @@ def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
 
 
 def _evaluated(
-    spec: SweepSpec, layouts: Sequence[RigLayout], workers: int | None
+    spec: SweepSpec, layouts: Sequence[RigLayout], workers: int | None, tolerances: Tolerances | None
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield results of layouts as worker processes finish them."""
     count = min(workers or os.cpu_count() or 1, len(layouts))
     if count <= 1:
-        yield from ((layout.number, evaluate(spec, layout)) for layout in layouts)
+        yield from ((layout.number, evaluate(spec, layout, tolerances)) for layout in layouts)
         return
     todo = iter(layouts)
     with process_pool(count) as pool:
         running: dict[Future[dict[str, Any]], int] = {}
 
         def start(some: int) -> None:
-            running.update({pool.submit(evaluate, spec, layout): layout.number for layout in islice(todo, some)})
+            for layout in islice(todo, some):
+                running[pool.submit(evaluate, spec, layout, tolerances)] = layout.number
 
         start(2 * count)
         while running:
@@ -159,8 +187,8 @@ def _evaluated(
             start(len(ready))
 
 
-def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
-    """Evaluate one layout: choose its LEDs, and compute bound, dropout and exposure over the population."""
+def evaluate(spec: SweepSpec, layout: RigLayout, tolerances: Tolerances | None = None) -> dict[str, Any]:
+    """Evaluate one layout: choose its LEDs, and compute bound, dropout, exposure and units over the population."""
     whole = Scene.of(SceneSpec.from_mapping(layout.scene))
     scene = whole.of_first_eye()
     survey = _survey(spec, scene.spec.to_mapping())
@@ -188,8 +216,23 @@ def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
         "noise_deg": noise["median"],
         "coverage": coverage,
         "dropout": 1.0 - coverage["outline_and_2_glints"],
+        "sharp_depth_mm": sharp_depth_mm(scene, spec.sharp_px),
+        "field": field_share(scene, survey),
         **_exposure(scene),
+        **_units(whole, scene, survey, tolerances, spec.people),
     }
+
+
+def _units(
+    whole: Scene, scene: Scene, survey: RigPopulation, tolerances: Tolerances | None, people: int
+) -> dict[str, Any]:
+    """Compute what tolerances cost, and the median user's 95th-percentile error with drawn units."""
+    if tolerances is None:
+        return {"tolerances": None, "units": None, "units_deg": None}
+    weights = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=scene.rig)
+    own = of_this_eye(whole, tolerances)
+    found = tolerated(survey, tolerances, own, weights, min(UNIT_PEOPLE, people))
+    return {**found, "units_deg": found["units"]["U50E95"]}
 
 
 def _survey(spec: SweepSpec, scene: Mapping[str, Any]) -> RigPopulation:
@@ -218,7 +261,9 @@ def _exposure(scene: Scene) -> dict[str, Any]:
 
 def pareto(rows: Sequence[Mapping[str, Any]]) -> Bools:
     """Return which rows no other row dominates; an unknown value counts as the worst."""
-    table = np.array([[np.inf if row[goal] is None else float(row[goal]) for goal in GOALS] for row in rows])
+    table = np.array(
+        [[np.inf if row[goal] is None else sign * float(row[goal]) for goal, sign in GOALS.items()] for row in rows]
+    )
     beaten = np.zeros(len(table), dtype=bool)
     for k, one in enumerate(table):
         beaten[k] = bool(((table <= one).all(axis=1) & (table < one).any(axis=1)).any())
@@ -228,7 +273,7 @@ def pareto(rows: Sequence[Mapping[str, Any]]) -> Bools:
 def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[RigLayout]) -> dict[str, Any]:
     """Read all layouts and write the results."""
     rows = [_read(_path(folder, layout.number), layout.number) for layout in layouts]
-    front = pareto(rows)
+    front, survey = pareto(rows), _survey(spec, scene.spec.to_mapping())
     rows = [
         {**{k: v for k, v in row.items() if k != "schema"}, "pareto": bool(best)}
         for row, best in zip(rows, front, strict=True)
@@ -239,11 +284,15 @@ def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[RigLa
         "scene": scene.name,
         "people": spec.people,
         "seed": spec.seed,
-        "goals": list(GOALS),
+        "eye_box": {
+            "slippage_mm": spec.slippage_mm, "relief_mm": spec.relief_mm, "luminance_cd_m2": survey.luminance_cd_m2,
+            "field_mm": eye_box_mm(survey).tolist(), "sharp_px": spec.sharp_px,
+        },
+        "goals": [goal for goal in GOALS if any(row[goal] is not None for row in rows)],
         "layouts": len(rows),
         "pareto": [row["number"] for row in rows if row["pareto"]],
         "rows": rows,
-    }
+    }  # fmt: skip
     write_json(folder / SUMMARY, data)
     _write_table(folder / TABLE, rows)
     write_report(folder / REPORT, data)
@@ -252,7 +301,7 @@ def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[RigLa
 
 _KEYS = {
     "values", "leds", "chosen", "lights_mm", "people", "frame_to_frame_deg", "bound_deg", "noise_deg", "coverage",
-    "dropout", "cornea_w_m2", "cornea_share",
+    "dropout", "cornea_w_m2", "cornea_share", "sharp_depth_mm", "field", "units_deg",
 }  # fmt: skip
 
 
@@ -274,10 +323,10 @@ def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["layout", *names, "noise_deg", "U50E95_deg", "U95E95_deg", "dropout", "leds", "cornea_w_m2",
-                         "cornea_share", "chosen", "pareto"])  # fmt: skip
+                         "cornea_share", "sharp_depth_mm", "field", "units_deg", "chosen", "pareto"])  # fmt: skip
         for row in rows:
             users = row["frame_to_frame_deg"]
             values = [json.dumps(row["values"][name]) for name in names]
             writer.writerow([row["number"], *values, row["noise_deg"], users["U50E95"], users["U95E95"], row["dropout"],
-                             row["leds"], row["cornea_w_m2"], row["cornea_share"],
-                             " ".join(map(str, row["chosen"])), row["pareto"]])  # fmt: skip
+                             row["leds"], row["cornea_w_m2"], row["cornea_share"], row["sharp_depth_mm"],
+                             row["field"], row["units_deg"], " ".join(map(str, row["chosen"])), row["pareto"]])  # fmt: skip

@@ -115,6 +115,7 @@ class SweepSpec(FileSpec):
     relief_mm: NonNegative = Field(
         default=0.0, description="additional standard deviation of their distance: eye relief of a headset"
     )
+    sharp_px: Positive = Field(default=1.0, description="largest circle of confusion within the sharp depth")
     sweep: Sweep = Field(description="values to vary")
 
     def people_of(self) -> Population:
