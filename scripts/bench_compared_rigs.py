@@ -67,7 +67,8 @@ def main() -> int:
         report.add(row(f"{other}, {quantity}: intervals that hold {truth:.3g}", held, "seeds", must, at_least=True))
         report.add(row(f"{other}, {quantity}: half width, median", float(np.median((high - low) / 2)), ""))
         error = float(difference.std(ddof=1) / np.sqrt(seeds))
-        report.add(row(f"{other}, {quantity}: mean difference over its standard error", difference.mean() / max(error, 1e-300), ""))  # fmt: skip
+        name = f"{other}, {quantity}: mean difference over its standard error"
+        report.add(row(name, difference.mean() / max(error, 1e-300), ""))
     return report.finish(options.json, ("numpy", "scipy"))
 
 

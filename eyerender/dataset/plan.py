@@ -47,7 +47,7 @@ from .template import Template, Turn, possible
 RANKED_SUBJECTS = 1_000_000
 # Of a function without a spec, whose number of samples may grow: samples of a block of its plan, and of a shard.
 _PLANNED, _SHARD = 16_000, 16
-_UNIT = 0x75  # of the random numbers of units
+_UNIT, _SETTING = 0x75, 0x69  # of the random numbers of units and of settings
 _LOOKED_AT = 16  # samples that `Plan.warnings` checks for probable mistakes
 
 
@@ -352,6 +352,8 @@ class Plan:
         tree.setdefault("name", f"{spec.name} {sample}")
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
+        if isinstance(tree.get("rig"), dict) and (tree["rig"].get("ipd_adjust") or {}).get("residual_mm"):
+            tree["rig"] = _adjusted(tree, (spec.seed, turn.subject, _SETTING))
         if spec.tolerances is not None:
             tree["rig"] = self._unit_of(tree.get("rig"), turn.subject)
         eye, eye_drawn, _ = self._eye_of(tree, turn) if own is None else (own.eye, {}, False)
@@ -603,3 +605,15 @@ def _child(node: Any, key: str) -> Any:
     if isinstance(node, list):
         return node[int(key)] if key.isdigit() and int(key) < len(node) else None
     return node.get(key) if isinstance(node, dict) else None
+
+
+def _adjusted(tree: Mapping[str, Any], seed: tuple[int, ...]) -> dict[str, Any]:
+    """Return the rig of a scene, set to the wearer's distance of the eyes but for a residual that is drawn."""
+    spec = SceneSpec.from_mapping(tree)
+    adjust = spec.rig.set_to(spec.subject.ipd_mm).ipd_adjust
+    assert adjust is not None
+    assert adjust.set_mm is not None
+    # An error of the setting moves each eye's parts by half of it.
+    error = 2.0 * adjust.residual_mm * float(np.random.default_rng(seed).standard_normal())
+    given = tree["rig"]["ipd_adjust"].get("set_mm")
+    return {**tree["rig"], "ipd_adjust": {**adjust.to_mapping(), "set_mm": given or adjust.set_mm + error}}

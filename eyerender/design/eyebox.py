@@ -1,6 +1,9 @@
-"""What a layout gives up for a long lens: depth in focus, and the field of its cameras over the eye box."""
+"""The eye box of a survey, and what a layout gives up for a long lens: depth in focus, and field over the eye box."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +26,35 @@ def eye_box_mm(survey: RigPopulation) -> Floats:
     """Return the half widths (3,) mm of the box about the eye's place in which a survey places most eyes."""
     along = float(np.hypot(survey.slippage_mm, survey.relief_mm))
     return BOX_SD * np.array([along, survey.slippage_mm, survey.slippage_mm])
+
+
+def eye_box_of(survey: RigPopulation) -> dict[str, Any]:
+    """Return where eyes stand in a survey, for results."""
+    return {
+        "slippage_mm": survey.slippage_mm,
+        "relief_mm": survey.relief_mm,
+        "luminance_cd_m2": survey.luminance_cd_m2,
+        "ipd_adjust": survey.scene["rig"].get("ipd_adjust"),
+    }
+
+
+def eye_box_text(box: Mapping[str, Any]) -> str:
+    """Say in a sentence or two where eyes stand, from `eye_box_of`."""
+    adjust = box["ipd_adjust"]
+    moved = (
+        "Eyes stand at the scene's place, moved by half the difference in the distance of the pupils and, at random,"
+    )
+    text = (
+        f"{moved} by {box['slippage_mm']:g} mm per axis and {box['relief_mm']:g} mm of eye relief (standard "
+        f"deviations); pupils are those at {box['luminance_cd_m2']:g} cd/m²."
+    )
+    if adjust is None:
+        return text
+    low, high = adjust["range_mm"]
+    return (
+        f"{text} The parts of each eye follow its pupil from {low:g} to {high:g} mm and miss it by "
+        f"{adjust.get('residual_mm', 0.0):g} mm (standard deviation)."
+    )
 
 
 def sharp_depth_mm(scene: Scene, limit_px: float = 1.0) -> float:

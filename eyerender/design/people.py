@@ -36,7 +36,6 @@ from ..region.contour import inner_margins
 from ..region.globe import Globe
 from ..region.lids import EDGE_MM, LOWER_TILT_DEG, margin_width_mm
 from ..rig.camera import PinholeCamera
-from ..rig.rig import RigGeometry
 from ..scene import Scene
 from ..scene.people import Population
 from ..scene.spec import SceneSpec
@@ -138,9 +137,10 @@ class Figures(ArrayValue):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Someone:
-    """A person in front of the rig: eye, lids, position of the apex."""
+    """A person in front of the rig: eye, lids, position of the apex, and the scene with the rig set to this person."""
 
     subject: int
+    scene: Scene
     eye: EyeModel
     region: Region
     place_mm: Floats
@@ -164,15 +164,28 @@ def people_of(survey: RigPopulation, first: int, count: int) -> tuple[list[Someo
             refused.append(person.subject)
             continue
         found.append(
-            Someone(subject=person.subject, eye=eye, region=person.region(), place_mm=place_of(survey, scene, person))
+            Someone(
+                subject=person.subject,
+                scene=fitted(scene, person),
+                eye=eye,
+                region=person.region(),
+                place_mm=place_of(survey, scene, person),
+            )
         )
     return found, refused
+
+
+def fitted(scene: Scene, person: Person) -> Scene:
+    """Return the scene with its rig set to a person's distance of the pupils; the scene itself if it has no setting."""
+    rig = scene.spec.rig.set_to(person.ipd_mm)
+    return scene if rig is scene.spec.rig else scene.replaced(scene.spec.model_copy(update={"rig": rig}))
 
 
 def place_of(survey: RigPopulation, scene: Scene, person: Person) -> Floats:
     """Compute the apex (3,) mm of a person's unrotated eye in the world.
 
-    It is that of the scene, moved by half the difference in interpupillary distance and by a random slippage.
+    It is that of the scene, moved by half the difference in interpupillary distance, by a random slippage, and by what
+    remains after the rig is set to the distance.
     """
     side = scene.spec.subject.eyes[0]
     place = scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
@@ -180,23 +193,24 @@ def place_of(survey: RigPopulation, scene: Scene, person: Person) -> Floats:
     rng = np.random.default_rng((survey.seed, person.subject, 0x51))
     shift = survey.slippage_mm * rng.standard_normal(3)
     shift[0] += survey.relief_mm * rng.standard_normal()
+    if (adjust := scene.spec.rig.ipd_adjust) is not None:
+        shift[1] += adjust.residual_mm * rng.standard_normal()
     shift += survey.shift_mm
     return np.asarray(place + shift + np.array([0.0, half if side == "left" else -half, 0.0]))
 
 
 def figures_of(survey: RigPopulation, noise: FeatureNoise, first: int, count: int) -> Figures:
     """Compute the figures of some people."""
-    scene = Scene.of(SceneSpec.from_mapping(survey.scene))
     everyone, refused = people_of(survey, first, count)
     groups = _groups(everyone)
-    return Figures.joined([_nobody(refused), *(_of_group(survey, scene.rig, noise, some) for some in groups)])
+    return Figures.joined([_nobody(refused), *(_of_group(survey, noise, some) for some in groups)])
 
 
 def _groups(everyone: Sequence[Someone]) -> Iterator[list[Someone]]:
-    """Yield people whose eyes can be stacked, a few at a time."""
+    """Yield people before one rig whose eyes can be stacked, a few at a time."""
     kinds: dict[object, list[Someone]] = {}
     for one in everyone:
-        kinds.setdefault(structure_of(one.eye), []).append(one)
+        kinds.setdefault((structure_of(one.eye), id(one.scene)), []).append(one)
     for same in kinds.values():
         for start in range(0, len(same), TOGETHER):
             yield same[start : start + TOGETHER]
@@ -204,9 +218,13 @@ def _groups(everyone: Sequence[Someone]) -> Iterator[list[Someone]]:
 
 def cases_of(survey: RigPopulation, count: int) -> Iterator[tuple[Case, Floats | None]]:
     """Yield cases of the first people, a few people in each, and the lids about their eyes (see `visible`)."""
-    rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
+    return ((case, openings) for _, case, openings in surveyed(survey, count))
+
+
+def surveyed(survey: RigPopulation, count: int) -> Iterator[tuple[Scene, Case, Floats | None]]:
+    """Yield the same with the scene whose rig is set to these people."""
     for some in _groups(people_of(survey, 0, count)[0]):
-        yield _case(survey, rig, some), _openings(survey, some) if survey.lids else None
+        yield some[0].scene, _case(survey, some), _openings(survey, some) if survey.lids else None
 
 
 def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
@@ -214,14 +232,13 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
 
     All rays are traced once, for any number of `noises`; the result has one item for each.
     """
-    rig = Scene.of(SceneSpec.from_mapping(survey.scene)).rig
     unknowns, people = Unknowns.from_mapping(survey.unknowns), people_of(survey, 0, count)[0]
     occluders = survey.occluders
     if not people:
         raise InputError("no eye of this population is physically possible", path="population")
     parts: list[list[SiteInformation]] = [[] for _ in noises]
     for one in people:
-        case = _case(survey, rig, [one])
+        case, rig = _case(survey, [one]), one.scene.rig
         instants, theta = case.instants.take(CALIBRATION_CELLS), case.theta[CALIBRATION_CELLS]
         openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
         numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
@@ -290,9 +307,9 @@ def _nobody(refused: list[int]) -> Figures:
     )
 
 
-def _of_group(survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, people: list[Someone]) -> Figures:
+def _of_group(survey: RigPopulation, noise: FeatureNoise, people: list[Someone]) -> Figures:
     """Compute figures of a few people at once, camera by camera."""
-    case = _case(survey, rig, people)
+    case, rig = _case(survey, people), people[0].scene.rig
     i, m = len(case.theta), len(rig.lights)
     matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
     glints, lost = np.zeros((i, m), dtype=bool), np.zeros((i, len(LOST)), dtype=np.int64)
@@ -321,7 +338,7 @@ def _of_group(survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, peop
     )
 
 
-def _case(survey: RigPopulation, rig: RigGeometry, people: list[Someone]) -> Case:
+def _case(survey: RigPopulation, people: list[Someone]) -> Case:
     """Create a case of all directions of some people, one instant each; the camera is set later."""
     eyes = stacked_eyes([one.eye for one in people])
     cells = GRID * GRID
@@ -330,7 +347,8 @@ def _case(survey: RigPopulation, rig: RigGeometry, people: list[Someone]) -> Cas
     theta[:, [AZIMUTH, ELEVATION]] = np.radians(np.tile(survey.directions_deg, (len(people), 1)))
     theta[:, PUPIL] = diameters_mm(eyes)[person]
     places = np.array([one.place_mm for one in people])[person]
-    views = Views(eyes=eyes, person=person, position_mm=places, camera=np.zeros(len(person), np.int64), rig=rig)
+    camera, rig = np.zeros(len(person), np.int64), people[0].scene.rig
+    views = Views(eyes=eyes, person=person, position_mm=places, camera=camera, rig=rig)
     nowhere = np.full((len(person), 3), np.nan)
     return Case(views=views, instant=np.arange(len(person)), instants=views, theta=theta, target_mm=nowhere)
 

@@ -30,9 +30,9 @@ from ..scene import Scene
 from ..scene.observation import EYES
 from ..scene.spec import SceneSpec
 from .crowd import OUTLINE, users_of
-from .information import information_of_views, whitened_rows
+from .information import Case, information_of_views, whitened_rows
 from .noise import FeatureNoise
-from .people import CALIBRATION_CELLS, GRID, POINTS, RigPopulation, cases_of, learned, seen_features
+from .people import CALIBRATION_CELLS, GRID, POINTS, RigPopulation, learned, seen_features, surveyed
 from .unknowns import Unknowns
 from .varied import FeatureSlopes, Views, gaze_slopes, images_of
 
@@ -220,7 +220,7 @@ def unit_errors(survey: RigPopulation, tolerances: Tolerances, noise: FeatureNoi
     """
     scene = Scene.of(SceneSpec.from_mapping(survey.scene))
     axes = list(axes_of(scene, tolerances))
-    parts = [_of_group(survey, scene.rig, noise, axes, group) for group in cases_of(survey, people)]
+    parts = [_of_group(survey, noise, tolerances, group) for group in surveyed(survey, people)]
     errors, glints, outline = (np.concatenate(each) for each in zip(*parts, strict=True))
     enough = min(2, len(scene.rig.lights))
     return UnitErrors(
@@ -241,7 +241,7 @@ def axes_of(scene: Scene, tolerances: Tolerances) -> Iterator[_Axis]:
                     sd=one.sd,
                     before=one.when == "before",
                     cameras=tuple(range(len(rig.cameras))) if one.part == "led" else (number,),
-                    moved=_mover(rig, cameras, one, number, axis),
+                    moved=_mover(scene, one, number, axis),
                 )
 
 
@@ -260,13 +260,12 @@ def _numbers(one: Tolerance, k: int, lights: int, cameras: Sequence[Camera]) -> 
     return numbers
 
 
-def _mover(
-    rig: RigGeometry, cameras: Sequence[Camera], one: Tolerance, number: int, axis: int
-) -> Callable[[float], RigGeometry]:
+def _mover(scene: Scene, one: Tolerance, number: int, axis: int) -> Callable[[float], RigGeometry]:
+    rig = scene.rig
     if one.part == "led":
         return lambda amount: _with_light(rig, number, np.eye(3)[axis] * amount)
     if one.part == "mirror":
-        return lambda amount: _with_camera(rig, number, _mirrored(cameras[number], one.quantity, axis, amount))
+        return lambda amount: _with_mirror(scene, number, one.quantity, axis, amount)
     return lambda amount: _with_camera(rig, number, _deviating(rig.cameras[number], one.quantity, axis, amount))
 
 
@@ -278,6 +277,14 @@ def _with_light(rig: RigGeometry, number: int, shift_mm: Floats) -> RigGeometry:
 
 def _with_camera(rig: RigGeometry, number: int, camera: PinholeCamera) -> RigGeometry:
     return replace(rig, cameras=tuple(camera if k == number else old for k, old in enumerate(rig.cameras)))
+
+
+def _with_mirror(scene: Scene, number: int, quantity: str, axis: int, amount: float) -> RigGeometry:
+    spec = scene.spec
+    cameras = list(spec.rig.cameras)
+    mirror = _moved_mirror(cameras[number], quantity, axis, amount)
+    cameras[number] = cameras[number].model_copy(update={"mirror": mirror})
+    return spec.rig.model_copy(update={"cameras": tuple(cameras)}).build(spec.subject.ipd_mm)
 
 
 def _deviating(camera: PinholeCamera, quantity: str, axis: int, amount: float) -> PinholeCamera:
@@ -293,10 +300,6 @@ def _deviating(camera: PinholeCamera, quantity: str, axis: int, amount: float) -
     else:
         K[axis, 2] += amount
     return replace(camera, K=frozen(K), R=frozen(R), t=frozen(t))
-
-
-def _mirrored(camera: Camera, quantity: str, axis: int, amount: float) -> PinholeCamera:
-    return camera.model_copy(update={"mirror": _moved_mirror(camera, quantity, axis, amount)}).build()
 
 
 def _moved_mirror(camera: Camera, quantity: str, axis: int, amount: float) -> Mirror:
@@ -320,10 +323,11 @@ def _about(axis: Floats, angle_deg: float) -> Floats:
 
 
 def _of_group(
-    survey: RigPopulation, rig: RigGeometry, noise: FeatureNoise, axes: Sequence[_Axis], group: Any
+    survey: RigPopulation, noise: FeatureNoise, tolerances: Tolerances, group: tuple[Scene, Case, Floats | None]
 ) -> tuple[Floats, Ints, Floats]:
     """Compute errors (p, 81, e, 2) deg, numbers of glints (p, 81) and shares of the outline (p, 81) of some people."""
-    (case, openings), occluders = group, survey.occluders
+    scene, case, openings = group
+    rig, axes, occluders = scene.rig, list(axes_of(scene, tolerances)), survey.occluders
     i, free = len(case.theta), Unknowns.from_mapping(survey.unknowns).free()
     size = len(free)
     matrices, pulls = np.zeros((i, size, size)), np.zeros((len(axes), i, size))

@@ -14,6 +14,8 @@ from .imaging import Star as Star
 from .imaging import Sun as Sun
 from .light import Lamp as Lamp
 from .light import LedRing as LedRing
+from .mount import IpdAdjustment as IpdAdjustment
+from .mount import Mount as Mount
 from .obstacles import Obstacle as Obstacle
 from .obstacles import ObstacleRing as ObstacleRing
 from .opencv import OpenCvCalibration as OpenCvCalibration

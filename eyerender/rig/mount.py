@@ -1,14 +1,15 @@
-"""The mount of a rig: a rigid motion of all its cameras, lights and obstacles: a tilted headset, a tolerance."""
+"""Motions of a rig: its mount, as of a tilted headset, and the adjustment of each eye's parts to the wearer's eyes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ..base.arrays import Body, Floats, frozen
-from ..base.spec import Spec, Vec3
+from ..base.spec import EYES, NonNegative, Positive, Side, Spec, Vec3
 from ..optics.transforms import rotated
 from .camera import PinholeCamera
 from .light import Lamp
@@ -52,6 +53,49 @@ class Mount(Spec):
 
     def body(self, body: Body) -> Body:
         """Move an obstacle."""
-        rotation, offset = self._motion()
+        rotation, offset = self.motion()
         moved = frozen(body.vertices @ rotation.T + offset)
         return replace(body, vertices=moved, normals=frozen(body.normals @ rotation.T))
+
+class IpdAdjustment(Spec):
+    """A mechanism that moves the parts of each eye (those whose `eyes` names it alone) to the wearer's eyes, along y.
+
+    Each eye's parts move by half the difference of the setting from `design_mm`; a camera takes its mirror along.
+    """
+
+    range_mm: tuple[Positive, Positive] = Field(description="least and largest setting")
+    residual_mm: NonNegative = Field(
+        default=0.0,
+        description="standard deviation of what remains between each eye and its parts, along y, for drawn people",
+    )
+    design_mm: Positive = Field(default=63.0, description="setting at which the parts are where the rig says")
+    set_mm: Positive | None = Field(
+        default=None, description="the setting; default: the wearer's `ipd_mm`, or the nearest end of the range"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.range_mm[0] > self.range_mm[1]:
+            raise ValueError("range_mm must not fall")
+        return self
+
+    def nearest_mm(self, ipd_mm: float) -> float:
+        """Return the setting of the range that is nearest to a wearer's distance."""
+        return min(max(ipd_mm, self.range_mm[0]), self.range_mm[1])
+
+    def _shift(self, eyes: tuple[Side, ...] | None, ipd_mm: float | None) -> Floats | None:
+        """Return the shift (3,) mm of a part that serves these eyes; None if it stays."""
+        setting = self.set_mm if self.set_mm is not None or ipd_mm is None else self.nearest_mm(ipd_mm)
+        if eyes is None or len(eyes) != 1 or setting is None:
+            return None
+        return np.array([0.0, (setting - self.design_mm) / 2.0 * (-1.0 if eyes[0] == EYES[0] else 1.0), 0.0])
+
+    def camera(self, camera: PinholeCamera, ipd_mm: float | None) -> PinholeCamera:
+        """Move a camera to a wearer's eye; without a distance or a setting, it stays."""
+        shift = self._shift(camera.eyes, ipd_mm)
+        return camera if shift is None else replace(camera, t=frozen(camera.t - rotated(camera.R, shift)))
+
+    def lamp(self, lamp: Lamp, ipd_mm: float | None) -> Lamp:
+        """Move a light in the same way."""
+        shift = self._shift(lamp.eyes, ipd_mm)
+        return lamp if shift is None else replace(lamp, position_mm=frozen(lamp.position_mm + shift))

@@ -15,7 +15,7 @@ from ..base.errors import InputError
 from ..base.spec import KeyProblem, Side, Spec
 from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
-from .mount import Mount
+from .mount import IpdAdjustment, Mount
 from .obstacles import Obstacle
 from .screen import Screen, ScreenPlane
 from .unit import UnitCalibration
@@ -51,6 +51,12 @@ class Rig(Spec):
     obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=MAX_OBSTACLES)] = Field(
         default=(),
         description="bodies that block light from LEDs to eyes and from eyes to cameras: a barrel, a bezel, a seal",
+    )
+
+    ipd_adjust: IpdAdjustment | None = Field(
+        default=None,
+        description="moves the cameras and LEDs of each eye (whose `eyes` names it alone) to the wearer's eyes, before "
+        "the mount",
     )
 
     @model_validator(mode="after")
@@ -148,7 +154,7 @@ class Rig(Spec):
         """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
-        geometry, leds = self.model_copy(update={"mount": None}).build(), []
+        geometry, leds = self.model_copy(update={"mount": None, "ipd_adjust": None}).build(), []
         for led in self.lights:
             if led.ring is None:
                 leds.append(led.to_mapping())
@@ -159,7 +165,8 @@ class Rig(Spec):
         return leds
 
     def _with_leds(self, leds: list[dict[str, Any]], **fields: Any) -> Self:
-        kept = {name: getattr(self, name) for name in ("cameras", "screen", "mount", "obstacles")} | {"lights": leds}
+        kept = {"cameras": self.cameras, "lights": leds}
+        kept |= {name: getattr(self, name) for name in ("screen", "mount", "obstacles", "ipd_adjust")}
         return type(self).from_mapping({**kept, **fields})
 
     def resolved(self, base: Path | None = None) -> Self:
@@ -185,14 +192,24 @@ class Rig(Spec):
         )
         return self.model_copy(update={"obstacles": placed}) if placed else self
 
-    def build(self) -> RigGeometry:
-        """Build the numeric rig."""
+    def set_to(self, ipd_mm: float) -> Self:
+        """Adjust the rig to a wearer's distance of the eyes, within its range; without `ipd_adjust` this is the rig."""
+        if self.ipd_adjust is None:
+            return self
+        setting = {"set_mm": self.ipd_adjust.nearest_mm(ipd_mm)}
+        return self.model_copy(update={"ipd_adjust": self.ipd_adjust.model_copy(update=setting)})
+
+    def build(self, ipd_mm: float | None = None) -> RigGeometry:
+        """Build the numeric rig, adjusted to a wearer's distance of the eyes if it has `ipd_adjust`."""
         if self.calibration is not None:
-            return self.resolved().build()
+            return self.resolved().build(ipd_mm)
         cameras = tuple(camera.build() for camera in self.cameras)
         # A ring of LEDs surrounds the real camera, not its mirror image.
         places = tuple(camera.unmirrored() for camera in self.cameras)
         lights = tuple(light for spec in self.lights for light in spec.build(places))
+        if self.ipd_adjust is not None:
+            cameras = tuple(self.ipd_adjust.camera(camera, ipd_mm) for camera in cameras)
+            lights = tuple(self.ipd_adjust.lamp(light, ipd_mm) for light in lights)
         if self.mount is not None:
             cameras = tuple(map(self.mount.camera, cameras))
             lights = tuple(map(self.mount.lamp, lights))
@@ -206,8 +223,8 @@ class RigLike(Protocol):
     Functions that accept either begin with `rig = rig.build()`.
     """
 
-    def build(self) -> RigGeometry:
-        """Build the numeric rig."""
+    def build(self, ipd_mm: float | None = None) -> RigGeometry:
+        """Build the numeric rig, adjusted to a wearer's distance of the eyes if it can be."""
         ...
 
 
@@ -224,8 +241,8 @@ class RigGeometry(ArrayValue):
     obstacles: tuple[Obstacle, ...] = ()
     mount: Mount | None = None
 
-    def build(self) -> RigGeometry:
-        """Return this rig, which is already numeric."""
+    def build(self, ipd_mm: float | None = None) -> RigGeometry:
+        """Return this rig, which is already numeric and adjusted."""
         return self
 
     def bodies(self) -> tuple[Body, ...]:

@@ -105,7 +105,7 @@ class Frames(ArrayValue):
         Raises:
             InputError: the rig has another number of cameras, or one does not see an eye of its frames.
         """
-        if rig is None or (built := rig.build()) == self.scene.rig:
+        if rig is None or (built := rig.build(self.scene.spec.subject.ipd_mm)) == self.scene.rig:
             return self
         if len(built.cameras) != len(self.scene.rig.cameras):
             raise InputError(
@@ -203,7 +203,7 @@ class Scene:
             device, spec = spec.rig.calibration, spec.model_copy(update={"rig": authored})
             if device is not None:
                 spec = SceneSpec.from_mapping(spec.to_mapping(), source=source)  # whose checks need all cameras
-        built = spec.rig.located(base).build() if rig is None else rig
+        built = spec.rig.located(base).build(spec.subject.ipd_mm) if rig is None else rig
         if spec.sensor.exposure_ms is None:
             spec = spec.model_copy(update={"sensor": _exposed(spec, built)})
         eyes: EyeSpec | _DrawnEyes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,15 +70,7 @@ def test_lids_hide_features_when_they_close(survey, monkeypatch):
     def blinking(amount):
         def made(survey, first, count):
             found, refused = real(survey, first, count)
-            closed = [
-                people.Someone(
-                    subject=one.subject,
-                    eye=one.eye,
-                    region=one.region.model_copy(update={"blink": amount}),
-                    place_mm=one.place_mm,
-                )
-                for one in found
-            ]
+            closed = [replace(one, region=one.region.model_copy(update={"blink": amount})) for one in found]
             return closed, refused
 
         monkeypatch.setattr(people, "people_of", made)

@@ -21,6 +21,7 @@ from ...base.errors import InputError
 from ...base.progress import Progress
 from ...base.storage.files import write_json
 from ...design.crowd import covered, figures_of_people
+from ...design.eyebox import eye_box_of, eye_box_text
 from ...design.noise import sensor_noise
 from ...design.people import Figures
 from ...folders.outfolder import staged
@@ -36,11 +37,12 @@ EQUAL = "equal"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
-    """A rig's values, (people,) by quantity and NaN where a person has none, and what they were computed from."""
+    """A rig's values, (people,) by quantity and NaN where a person has none, their origin, and where the eyes stand."""
 
     name: str
     values: dict[str, Floats]
     figures: Figures
+    eye_box: dict[str, Any]
 
 
 QUANTITIES = {
@@ -96,6 +98,7 @@ def compare_rigs(
         "people": len(subjects),
         "people_for_estimators": min(size.sample, len(subjects)),
         "seed": size.seed,
+        "eye_boxes": {one.name: one.eye_box for one in people},
         "quantities": {name: {"unit": unit, "meaning": text} for name, (unit, text) in QUANTITIES.items()},
         "comparisons": rows,
         "for_whom": [row for a, b in combinations(people, 2) for row in _for_whom(a, b, traits)],
@@ -121,12 +124,12 @@ def _evaluated(
         noise = sensor_noise(first)
         found = figures_of_people(survey, noise, size.people, workers=size.workers, progress=progress)
         biases = estimator_errors(survey, found.subject[: size.sample].tolist(), progress)
-        parts.append((first, found, biases))
+        parts.append((first, found, biases, eye_box_of(survey)))
     together = np.logical_and.reduce(
-        [covered(found, min(2, len(scene.rig.lights))) for scene, found, _ in parts]
+        [covered(found, min(2, len(scene.rig.lights))) for scene, found, *_ in parts]
     )  # directions that every rig covers
     out = []
-    for name, (scene, found, biases) in zip(names, parts, strict=True):
+    for name, (scene, found, biases, box) in zip(names, parts, strict=True):
         lights = len(scene.rig.lights)
         values = {
             "noise": _e95(np.where(together, found.noise_deg, np.nan)),
@@ -136,7 +139,7 @@ def _evaluated(
             "missing glints": 1.0 - found.glints.mean(axis=1) / max(lights, 1),
         }
         values |= {f"error of {bias.name}": _e95(bias.error_deg) for bias in biases if bias.error_deg.size}
-        out.append(Compared(name=name, values=values, figures=found))
+        out.append(Compared(name=name, values=values, figures=found, eye_box=box))
     return out
 
 
@@ -201,6 +204,7 @@ def page_of(data: dict[str, Any]) -> Page:
         f"those of {data['people_for_estimators']} people on exact features. Less is better in every quantity.",
         "A difference is the mean over people of second minus first, with its 95 % interval. Rigs are called equal "
         "where the interval holds 0.",
+        *(f"{name}: {eye_box_text(box)}" for name, box in data["eye_boxes"].items()),
     ]
     cards = [Card(f"{len(better)} of {len(data['comparisons'])}", "quantities in which one rig is better")]
     sections = [

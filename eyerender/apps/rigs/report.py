@@ -29,8 +29,9 @@ from ...design.crowd import (
     gaze_of,
     users_of,
 )
+from ...design.eyebox import eye_box_of, eye_box_text
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
-from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, place_of
+from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, fitted, place_of
 from ...design.safety import BOX_MM, NOTE, eye_exposure
 from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
 from ...design.unknowns import Unknowns
@@ -45,7 +46,6 @@ from ...report.page import Card, Figure, Page, Section, Table, degrees_text, wri
 from ...report.style import heat_map
 from ...rig.rig import RigGeometry
 from ...scene import Scene
-from ...scene.observation import EYES
 from ...scene.people import Population
 from ...scene.spec import SceneSpec, Targets
 from ...scene.subject import Subject
@@ -204,8 +204,8 @@ def _scene_of(survey: RigPopulation, subject: int, cells: Ints) -> Scene:
         person, eyes=(side,), head_positions_mm=(tuple(head.tolist()),), luminance_cd_m2=survey.luminance_cd_m2
     )
     return Scene(
-        own, spec.rig, targets=Targets.at(place + _TARGET_MM * way), wavelength_nm=spec.wavelength_nm,
-        sensor=spec.sensor, lens=spec.lens, ambient=spec.ambient, image=spec.image,
+        own, fitted(base, person).spec.rig, targets=Targets.at(place + _TARGET_MM * way),
+        wavelength_nm=spec.wavelength_nm, sensor=spec.sensor, lens=spec.lens, ambient=spec.ambient, image=spec.image,
     )  # fmt: skip
 
 
@@ -233,10 +233,7 @@ def summary(
         "refused": found.refused.tolist(),
         "directions": GRID * GRID,
         "seed": survey.seed,
-        "eye_box": {
-            "slippage_mm": survey.slippage_mm, "relief_mm": survey.relief_mm, "safety_mm": list(BOX_MM),
-            "luminance_cd_m2": survey.luminance_cd_m2,
-        },
+        "eye_box": {**eye_box_of(survey), "safety_mm": list(BOX_MM)},
         "unknowns": dict(survey.unknowns),
         "noise": {
             "outline_px": [finite_or_none(v) for v in noise.outline_px],
@@ -318,9 +315,7 @@ def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str,
     lead = [
         _answer(data),
         f"{data['people']} people look in {GRID * GRID} directions in front of the rig of '{scene.name}'. "
-        f"Eyes stand at the scene's place, moved by half the difference in the distance of the pupils and, at random, "
-        f"by {survey.slippage_mm:g} mm per axis and {survey.relief_mm:g} mm of eye relief (standard deviations); "
-        f"pupils are those at {survey.luminance_cd_m2:g} cd/m². Everything but errors on images is ray optics.",
+        f"{eye_box_text(data['eye_box'])} Everything but errors on images is ray optics.",
         "The bound is the smallest error that any unbiased estimator can have with these features. It counts noise "
         "alone. What an estimator assumes wrongly about the eye comes on top. U50E95 and U95E95 are the median and the "
         "95th-percentile person's 95th-percentile error over the directions that the rig covers.",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...design.eyebox import eye_box_text
 from ...report.page import Card, Figure, Page, Section, Table, degrees_text, write_page
 from ...report.style import ANALYTIC, IMAGE, figure, log_scale, svg
 
@@ -39,8 +40,7 @@ def write_report(path: Path, data: Mapping[str, Any]) -> None:
         + f"The sharp depth is that with circles of confusion below {box['sharp_px']:g} px. The field is the share of "
         f"the eye box ({', '.join(f'{half:g}' for half in box['field_mm'])} mm to either side in depth, across and up) "
         "and of the directions with the whole pupil in a picture. "
-        f"Eyes slip by {box['slippage_mm']:g} mm per axis and {box['relief_mm']:g} mm in depth (standard deviations); "
-        f"pupils are those at {box['luminance_cd_m2']:g} cd/m². The noise counts the sensor alone. What an estimator assumes "
+        f"{eye_box_text(box)} The noise counts the sensor alone. What an estimator assumes "
         "wrongly about the eye comes on top.",
     ]
     plots = (

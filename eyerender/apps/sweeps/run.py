@@ -27,8 +27,8 @@ from ...base.storage.files import make_folder, read_json, write_json
 from ...base.storage.lock import final_lock, run_lock
 from ...design.choice import choose_lights, noise_of_some
 from ...design.crowd import coverage_of, covered, gaze_of
+from ...design.eyebox import eye_box_mm, eye_box_of, field_share, sharp_depth_mm
 from ...design.noise import FeatureNoise, sensor_noise
-from ...design.eyebox import eye_box_mm, field_share, sharp_depth_mm
 from ...design.people import RigPopulation, figures_of, sites_seen
 from ...design.safety import eye_exposure
 from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
@@ -285,8 +285,7 @@ def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[RigLa
         "people": spec.people,
         "seed": spec.seed,
         "eye_box": {
-            "slippage_mm": spec.slippage_mm, "relief_mm": spec.relief_mm, "luminance_cd_m2": survey.luminance_cd_m2,
-            "field_mm": eye_box_mm(survey).tolist(), "sharp_px": spec.sharp_px,
+            **eye_box_of(survey), "field_mm": eye_box_mm(survey).tolist(), "sharp_px": spec.sharp_px
         },
         "goals": [goal for goal in GOALS if any(row[goal] is not None for row in rows)],
         "layouts": len(rows),
@@ -329,4 +328,5 @@ def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             values = [json.dumps(row["values"][name]) for name in names]
             writer.writerow([row["number"], *values, row["noise_deg"], users["U50E95"], users["U95E95"], row["dropout"],
                              row["leds"], row["cornea_w_m2"], row["cornea_share"], row["sharp_depth_mm"],
-                             row["field"], row["units_deg"], " ".join(map(str, row["chosen"])), row["pareto"]])  # fmt: skip
+                             row["field"], row["units_deg"],
+                             " ".join(map(str, row["chosen"])), row["pareto"]])  # fmt: skip
