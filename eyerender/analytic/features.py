@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..base.arrays import ArrayValue, Bools, Floats, Statuses
 from ..base.errors import InputError
-from ..base.status import Status
+from ..base.status import Status, mark
 from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
@@ -259,7 +259,7 @@ class View:
         """Project points of the eye frame to pixels (n, k, 2); NaN where the status is not OK."""
         camera, found = self.camera, np.array(status, dtype=np.int8)
         if camera.is_fisheye:
-            return self._through_fisheye(points, found)
+            return self._in_mirror(*self._through_fisheye(points, found))
         plain = not is_distorted(camera.distortion)
         scale = (
             (camera.across * camera.K[0, 0], camera.K[0, 2], camera.K[1, 1], camera.K[1, 2])
@@ -270,7 +270,14 @@ class View:
         x, y, z = (np.ascontiguousarray(axis) for axis in points)
         ends = np.array(scale), int(Status.BEHIND_CAMERA)
         project_all(self.rotation, self.translation, x, y, z, found, *ends, seen)
-        return seen if plain else camera.pixels_of(seen[..., 0], seen[..., 1]), found
+        return self._in_mirror(seen if plain else camera.pixels_of(seen[..., 0], seen[..., 1]), found)
+
+    def _in_mirror(self, pixels: Floats, status: Statuses) -> tuple[Floats, Statuses]:
+        """Remove pixels beside the outline of the camera's mirror; `status` is changed."""
+        if (beside := self.camera.beside_mirror(pixels)) is None:
+            return pixels, status
+        mark(status, beside, Status.BESIDE_MIRROR)
+        return np.where((status == Status.OK)[..., None], pixels, np.nan), status
 
     def _through_fisheye(self, points: Xyz, status: Statuses) -> tuple[Floats, Statuses]:
         """Project points of the eye frame as `project` does; `status` is changed."""

@@ -29,6 +29,7 @@ from ..scene.observation import (
     PupilFeatures,
 )
 from .features import Features, features
+from .ghosts import ghost_glint_features
 from .occluders import Occluders
 
 ARC_POINTS = 6
@@ -158,6 +159,7 @@ class AnalyticObserver:
             pupil=pupil_features(seen),
             glints=glint_features(seen),
             lens_glints=lens_glint_features(scene.rig, eyes, which, index),
+            ghost_glints=ghost_glint_features(scene.rig, eyes, which, index, pose),
         )
         return observed, seen
 

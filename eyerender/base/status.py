@@ -35,6 +35,7 @@ class Status(IntEnum):
     AT_LENS_EDGE = 17
     BEHIND_OBSTACLE = 18
     BEHIND_OPENING = 19
+    BESIDE_MIRROR = 20
     # Fixations.
     TARGET_TOO_NEAR = 9
     OUT_OF_REACH = 10
@@ -81,6 +82,7 @@ _REASONS = {
     Status.AT_LENS_EDGE: "at the edge of a lens",
     Status.BEHIND_OBSTACLE: "occluded by obstacle",
     Status.BEHIND_OPENING: "occluded by frame",
+    Status.BESIDE_MIRROR: "beside the mirror",
     Status.TARGET_TOO_NEAR: "the target lies inside the eye",
     Status.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     Status.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",

@@ -43,6 +43,7 @@ from .distortion import (
     is_imaged,
     undistort,
 )
+from .mirror import Mirror, MirrorPlate
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
@@ -130,31 +131,6 @@ AnyCalibration = Annotated[
     Annotated[CameraCalibration, Tag("[numbers]")] | Annotated[CalibrationFile, Tag("[file]")],
     Discriminator(_calibration_tag),
 ]
-
-
-class Mirror(Spec):
-    """A plane mirror through which a camera sees the eyes. It has no edges and shows no LEDs."""
-
-    point_mm: Vec3 = Field(description="a point of the plane, in the world")
-    normal: Vec3 = Field(description="vector across the plane, of any length and either sign")
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if not np.linalg.norm(self.normal) > 1e-9:
-            raise ValueError("normal must not be zero")
-        return self
-
-    @property
-    def plane(self) -> tuple[Floats, float]:
-        """Return the plane n . x = d as its unit normal n (3,) and its offset d in mm."""
-        normal = np.array(self.normal, dtype=float)
-        normal /= np.linalg.norm(normal)
-        return normal, float(normal @ np.array(self.point_mm, dtype=float))
-
-    def image_of(self, points_mm: ArrayLike) -> Floats:
-        """Reflect world points (..., 3) in the mirror's plane."""
-        points, (normal, offset) = np.asarray(points_mm, dtype=float), self.plane
-        return np.asarray(points - 2.0 * (points @ normal - offset)[..., None] * normal)
 
 
 class Camera(Spec):
@@ -372,6 +348,7 @@ class PinholeCamera(ArrayValue):
             stored picture; `unflipped` is the camera before the flip.
         relative_illumination: (n, 2) angles from the axis (deg) and shares, in place of the projection's fall-off.
         reach: radius of the coordinates of `plane` up to which the lens was measured; beyond it there is no picture.
+        mirror: the mirror behind which it is, in its own frame.
     """
 
     K: Floats
@@ -385,6 +362,7 @@ class PinholeCamera(ArrayValue):
     flip: bool = False
     relative_illumination: Floats | None = None
     reach: float = np.inf
+    mirror: MirrorPlate | None = None
 
     @classmethod
     def of(
@@ -455,10 +433,9 @@ class PinholeCamera(ArrayValue):
             raise InputError("lies in the plane of its mirror", path=f"camera {self.name!r}")
         reflect = np.eye(3) - 2.0 * np.outer(normal, normal)
         flip = np.array([-1.0, 1.0, 1.0])
-        t = rotated(self.R, 2.0 * offset * normal) + self.t
-        return replace(
-            self, R=frozen(flip[:, None] * (self.R @ reflect)), t=frozen(flip * t), mirrored=not self.mirrored
-        )
+        t = flip * (rotated(self.R, 2.0 * offset * normal) + self.t)
+        R = flip[:, None] * (self.R @ reflect)
+        return replace(self, R=frozen(R), t=frozen(t), mirrored=not self.mirrored, mirror=mirror.plate(R, t))
 
     def sees(self, side: str) -> bool:
         """Return whether the camera sees an eye, right or left."""
@@ -552,7 +529,7 @@ class PinholeCamera(ArrayValue):
 
     def flattened(self, pixel: ArrayLike) -> PinholeCamera:
         """Return a camera without distortion, whose pixels `ideal` gives; a fisheye's looks along a pixel's ray."""
-        flat = replace(self, distortion=frozen(np.zeros(5)))
+        flat = replace(self, distortion=frozen(np.zeros(5)), mirror=None)
         if not self.is_fisheye:
             return flat
         R = facing(self.rays(pixel)).T
@@ -601,16 +578,20 @@ class PinholeCamera(ArrayValue):
         """Return the light of a surface and of a point at a world point (3,) mm, relative to the lens' axis.
 
         They are those of a fisheye, or of a lens with `relative_illumination`; 1 for others, which are aimed at eyes.
+        A mirror reduces them.
         """
+        mirrored = 1.0 if self.mirror is None else self.mirror.reflectance
         if not self.is_fisheye and self.relative_illumination is None:
-            return 1.0, 1.0
+            return mirrored, mirrored
         way = rotated(self.R, np.asarray(point_mm, dtype=float) - self.nodal_point_mm)
         cosine = float(way[2] / np.linalg.norm(way))
         x, y, _ = self.plane(way)
         area = float(self.stretch(np.array(cosine)) * distorted_area(self.across * x, y, self.distortion))
-        share = max(cosine, 0.0) / area
+        share = mirrored * max(cosine, 0.0) / area
         if self.relative_illumination is not None:
-            share = float(np.interp(np.degrees(np.arccos(np.clip(cosine, -1, 1))), *self.relative_illumination.T))
+            share = mirrored * float(
+                np.interp(np.degrees(np.arccos(np.clip(cosine, -1, 1))), *self.relative_illumination.T)
+            )
         return share, share * area
 
     def corners(self, window: Window, depth_mm: float) -> Floats:
@@ -644,6 +625,21 @@ class PinholeCamera(ArrayValue):
         if np.hypot(np.abs(x).max(), np.abs(y).max()) <= reach:
             return None
         return np.asarray(np.hypot(x[None, :], y[:, None]) > reach)
+
+    def beside_mirror(self, pixels: Floats) -> Bools | None:
+        """Return which pixels (..., 2) have rays beside the outline of the mirror; None without an outline."""
+        if self.mirror is None or self.mirror.corners_mm is None:
+            return None
+        return ~self.mirror.holds(self.rays(pixels) @ self.R.T)
+
+    def dark(self, window: Window) -> Bools | None:
+        """Return which pixels (h, w) of a window get no light: without a ray, or beside the mirror; None if all do."""
+        beyond, (x0, y0, width, height) = self.without_rays(window), window
+        if self.mirror is None or self.mirror.corners_mm is None:
+            return beyond
+        v, u = np.mgrid[y0 : y0 + height, x0 : x0 + width]
+        beside = self.beside_mirror(np.stack([u, v], axis=-1).astype(float))
+        return beside if beyond is None else beyond | beside
 
     def in_image(self, pixels: ArrayLike) -> Bools:
         """Return whether pixels (..., 2) lie on the sensor, which ends half a pixel beyond its outer pixel centres."""

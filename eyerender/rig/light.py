@@ -15,6 +15,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.spec import EYES, NonNegative, Number, Positive, Side, Spec, Vec3
 from .camera import EyeNames, PinholeCamera, serves
+from .mirror import Mirror
 
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
 # frame.
@@ -75,6 +76,11 @@ class Led(Spec):
         description="eyes that it lights, all LEDs of a ring alike; the nose or a seal keeps its light "
         "from the other eye; default: both",
     )
+    mirror: Mirror | None = Field(
+        default=None,
+        description="plane mirror over which its light comes; place and aim are those of the LED itself, and the "
+        "default aim is over the mirror; it has no outline and no ghosts",
+    )
     duty_cycle: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None,
         description="share of the time in which it is on, for eye safety alone; pictures expose while it is on; "
@@ -89,6 +95,8 @@ class Led(Spec):
             raise ValueError("inner_radius_mm must be less than radius_mm")
         if self.position_mm is not None and np.allclose(self.position_mm, self._aim(self.position_mm), atol=1e-6):
             raise ValueError("aim_mm is the light's own position")
+        if self.mirror is not None and self.mirror.outline_mm is not None:
+            raise ValueError("mirror.outline_mm: the mirror of an LED has no outline")
         return self
 
     def _aim(self, place_mm: ArrayLike) -> Floats:
@@ -113,18 +121,23 @@ class Led(Spec):
                 camera.nodal_point_mm + self.ring.radius_mm * (np.cos(a) * camera.R[0] + np.sin(a) * camera.R[1])
                 for a in angles
             ]
+        share, aims = 1.0, [self._aim(place) for place in places]
+        if self.mirror is not None:
+            places, share = [self.mirror.image_of(place) for place in places], self.mirror.reflectance
+            own = self.aim_mm == NEAREST_EYE
+            aims = [self._aim(p) if own else self.mirror.image_of(aim) for p, aim in zip(places, aims, strict=True)]
         return tuple(
             Lamp(
                 position_mm=frozen(p),
                 axis=frozen((aim - p) / np.linalg.norm(aim - p)),
                 radius_mm=self.radius_mm,
-                intensity_mw_sr=self.intensity_mw_sr,
+                intensity_mw_sr=share * self.intensity_mw_sr,
                 lobe_exponent=self.lobe_exponent,
                 inner_radius_mm=self.inner_radius_mm,
                 duty_cycle=1.0 if self.duty_cycle is None else self.duty_cycle,
                 eyes=self.eyes,
             )
-            for p, aim in ((place, self._aim(place)) for place in places)
+            for p, aim in zip(places, aims, strict=True)
         )
 
 

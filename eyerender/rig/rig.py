@@ -154,7 +154,8 @@ class Rig(Spec):
         """Return the fields of all LEDs, with rings split into single ones; check that light `number` exists."""
         if not 0 <= number < self.light_count:
             raise InputError(f"there is no light {number}, only {self.light_count}", path="lights")
-        geometry, leds = self.model_copy(update={"mount": None, "ipd_adjust": None}).build(), []
+        bare = tuple(led.model_copy(update={"mirror": None}) for led in self.lights)
+        geometry, leds = self.model_copy(update={"lights": bare, "mount": None, "ipd_adjust": None}).build(), []
         for led in self.lights:
             if led.ring is None:
                 leds.append(led.to_mapping())

@@ -255,7 +255,7 @@ def covered(lens: Lens, sensor: Sensor, camera: PinholeCamera, window: Window) -
 
     None if there are no such pixels.
     """
-    beyond = camera.without_rays(window)
+    beyond = camera.dark(window)
     if not lens.openings and not any(sensor.border_px):
         return beyond
     found = _covered(lens.openings, sensor.border_px, tuple(camera.resolution_px), tuple(window))

@@ -107,6 +107,9 @@ class UnitCalibration(Spec):
             point = self._point(mirror.get("point_mm"), source, f"{path}.mirror.point_mm")
             normal = _vector(mirror.get("normal"), source, f"{path}.mirror.normal")
             own["mirror"] = {**mirror, "point_mm": point, "normal": rotated(R, normal)}
+            if isinstance(corners := mirror.get("outline_mm"), list):
+                outline = [self._point(corner, source, f"{path}.mirror.outline_mm") for corner in corners]
+                own["mirror"]["outline_mm"] = outline
         return {"resolution_px": found.size_px, **own, "calibration": calibration}
 
     def _led(self, given: Any, source: str, path: str) -> dict[str, Any]:

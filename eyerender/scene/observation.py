@@ -32,7 +32,7 @@ MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
 MAX_GLINTS = 5_000_000
 # Keys of a record that no scene fills yet: motion of rig and eye, further reflections.
 _UNUSED = ("rig_pose", "events", "blink_phase")
-_UNUSED_FEATURES = ("ghost_glints", "purkinje")
+_UNUSED_FEATURES = ("purkinje",)
 # Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
@@ -206,6 +206,7 @@ class Observations(ArrayValue):
     pupil: PupilFeatures
     glints: GlintFeatures
     lens_glints: LensGlintFeatures | None = None
+    ghost_glints: GlintFeatures | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -329,6 +330,7 @@ class Observations(ArrayValue):
             },
             "glints": _glint_records(self.glints, i),
             "lens_glints": None if lens_glints is None else _glint_records(lens_glints, i) or None,
+            "ghost_glints": None if self.ghost_glints is None else _glint_records(self.ghost_glints, i) or None,
             **dict.fromkeys(_UNUSED_FEATURES),
             # Only extractors have one; records of ray optics do not have the key.
             **({} if np.isnan(pupil.confidence[i]) else {"confidence": float(pupil.confidence[i])}),
@@ -406,6 +408,7 @@ class Observations(ArrayValue):
             ),
             glints=GlintFeatures(**reader.glints("glints")),
             lens_glints=reader.lens_glints(),
+            ghost_glints=reader.ghost_glints(),
         )
         for key in (*_UNUSED, *_UNUSED_FEATURES, "pupil.time_s"):
             reader.values(key)
@@ -543,6 +546,11 @@ class _Reader:
             else:
                 self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
         return frozen(out)
+
+    def ghost_glints(self) -> GlintFeatures | None:
+        if all(entries is None for entries in self.values("ghost_glints")):
+            return None
+        return GlintFeatures(**self.glints("ghost_glints"))
 
     def lens_glints(self) -> LensGlintFeatures | None:
         if all(entries is None for entries in self.values("lens_glints")):
@@ -697,14 +705,14 @@ def concatenate(parts: Iterable[Observations]) -> Observations:
         return replace(groups[0], **columns)
 
     joint: dict[str, Any] = {name: joined(name) for name in ("index", "pose", "pupil", "glints")}
-    if any(b.lens_glints is not None for b in batches):
-        batches = [b if b.lens_glints is not None else replace(b, lens_glints=_no_lens_glints(len(b))) for b in batches]
-        joint["lens_glints"] = joined("lens_glints")
+    further: list[tuple[str, type[GlintFeatures]]]
+    further = [("lens_glints", LensGlintFeatures), ("ghost_glints", GlintFeatures)]
+    for name, kind in further:
+        if any(getattr(b, name) is not None for b in batches):
+            nothing = [kind(status=np.zeros((len(b), 0), np.int8)) for b in batches]
+            batches = [replace(b, **{name: getattr(b, name) or none}) for b, none in zip(batches, nothing, strict=True)]
+            joint[name] = joined(name)
     return Observations(**joint)
-
-
-def _no_lens_glints(rows: int) -> LensGlintFeatures:
-    return LensGlintFeatures(status=np.zeros((rows, 0), np.int8))
 
 
 def _widened(a: Any, width: int) -> Any:

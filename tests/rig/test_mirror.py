@@ -10,8 +10,10 @@ import pytest
 import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.gaze.records import rig_from_mapping
-from eyerender.rig.camera import Camera
+from eyerender.optics.surfaces import components, join
+from eyerender.rig.camera import Camera, Mirror
 from eyerender.rig.rig import Rig
+from eyerender.scene.observation import Observations, concatenate
 from eyerender.scene.spec import SceneSpec
 
 # A headset: the camera sits at the temple and sees the eye in a mirror 20 mm before it. Its mirror image is at
@@ -156,3 +158,97 @@ def test_a_mirror_between_camera_and_eye_gives_a_warning():
 def test_mirrors_that_cannot_be_are_refused(mirror, reason):
     with pytest.raises(InputError, match=reason):
         Camera.from_mapping({**CAMERA, "mirror": mirror}).build()
+
+
+GLASS = {**MIRROR, "reflectance": 0.4, "thickness_mm": 1.5, "index": 1.5}
+
+
+def test_ghosts_are_displaced_by_the_plates_formula_and_reach_their_lamps():
+    """Follow each ghost from the real camera through the glass, with Snell's law alone, to the eye and its lamp.
+
+    A ray that leaves the plate is parallel to that of the front at 2 t sin a cos a / sqrt(n^2 - sin^2 a); 1e-6 mm.
+    """
+    seen = scene(mirror=GLASS).with_(gaze_deg=[[0, 0]])
+    found, eye, place = er.trace(seen), seen.eye("right"), seen.eye_position_mm("right")
+    assert found.ghost_glints.ok.all()
+    np.testing.assert_array_equal(
+        found.glints.xy_px, er.trace(scene(mirror=MIRROR).with_(gaze_deg=[[0, 0]])).glints.xy_px
+    )
+    normal, start = np.array(MIRROR["normal"]) / np.linalg.norm(MIRROR["normal"]), np.array(CAMERA["position_mm"])
+    point, n, t = np.array(MIRROR["point_mm"]), GLASS["index"], GLASS["thickness_mm"]
+    normal = normal * np.sign((start - point) @ normal)  # towards camera and eye
+
+    def reflected(way, axis):
+        return way - 2.0 * (way @ axis) * axis
+
+    def refracted(way, axis, eta):
+        cosine = -(way @ axis)
+        return eta * way + (eta * cosine - np.sqrt(1.0 - eta**2 * (1.0 - cosine**2))) * axis
+
+    for k, virtual in enumerate(seen.rig.cameras[0].rays(found.ghost_glints.xy_px[0])):
+        way = reflected(virtual, normal)
+        front = start + way * ((point - start) @ normal) / (way @ normal)
+        down = refracted(way, normal, 1.0 / n)
+        up = reflected(down, normal)
+        out = front + down * t / -(down @ normal) + up * t / (up @ normal)
+        leaving = refracted(up, -normal, n)
+        angle = np.arccos(-(way @ normal))
+        gap = np.linalg.norm(np.cross(out - front, reflected(way, normal)))
+        wanted = 2.0 * t * np.sin(angle) * np.cos(angle) / np.sqrt(n**2 - np.sin(angle) ** 2)
+        assert gap == pytest.approx(wanted, abs=1e-6)
+        hit = join(eye.front[0].hit(components((out - place)[None]), components(leaving[None]), True).point)
+        mirrored = reflected(leaving, eye.front[0].normal(hit)[0])
+        lamp = seen.rig.lights[k].position_mm - place - hit[0]
+        assert np.linalg.norm(np.cross(lamp, mirrored)) < 1e-6
+
+
+def test_ghosts_are_in_records_and_not_among_glints():
+    found = er.trace(scene(mirror=GLASS))
+    record = next(found.records())
+    assert [one["light"] for one in record["ghost_glints"]] == [0, 1, 2]
+    assert record["ghost_glints"][0]["xy_px"] != record["glints"][0]["xy_px"]
+    again = Observations.from_records(list(found.records()), complete=True)
+    np.testing.assert_allclose(again.ghost_glints.xy_px, found.ghost_glints.xy_px)
+    assert next(er.trace(scene(mirror=MIRROR)).records())["ghost_glints"] is None
+    plain = er.trace(scene(mirror=MIRROR))
+    both = concatenate([plain, found])
+    assert both.ghost_glints.ok[len(plain) :].any()
+    assert not both.ghost_glints.ok[: len(plain)].any()
+
+
+def small(centre_px: np.ndarray, half_px: float) -> dict[str, object]:
+    """A mirror whose outline is a square in the picture of the plain mirror."""
+    camera, (normal, offset) = scene(mirror=MIRROR).rig.cameras[0], Mirror.from_mapping(MIRROR).plane
+    square = centre_px + half_px * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    ways, start = camera.rays(square), camera.nodal_point_mm
+    return {**MIRROR, "outline_mm": (start + ways * ((offset - normal @ start) / (ways @ normal))[:, None]).tolist()}
+
+
+def test_nothing_is_seen_beside_the_outline():
+    plain = er.trace(scene(mirror=MIRROR))
+    glints = plain.glints.xy_px[0]
+    mirror = small(glints[0], 6.0)
+    found = er.trace(scene(mirror=mirror))
+    inside = (np.abs(glints - glints[0]) < 6.0).all(axis=1)
+    assert inside.sum() == 1
+    np.testing.assert_array_equal(found.glints.ok[0], inside)
+    assert found.glints.reason[0, 1] == "beside the mirror"
+    assert found.pupil.reason[0].startswith("beside the mirror")
+    dark = scene(mirror=mirror).rig.cameras[0].dark((0, 0, 400, 300))
+    v, u = np.nonzero(~dark)
+    np.testing.assert_allclose([u.mean(), v.mean()], glints[0], atol=0.5)  # whole pixels
+    assert (~dark).sum() == pytest.approx(144, abs=13)  # a row of pixels
+
+
+def test_an_led_over_a_mirror_is_its_mirror_image():
+    plain = {"position_mm": [20.0, -62.0, 5.0], "mirror": {**MIRROR, "reflectance": 0.7}, "aim_mm": [30.0, -48.0, 0.0]}
+    (lamp,) = Rig.from_mapping({"cameras": [CAMERA], "lights": [plain]}).build().lights
+    np.testing.assert_allclose(lamp.position_mm, unfolded(np.array(plain["position_mm"])), atol=1e-9)
+    way = unfolded(np.array(plain["aim_mm"])) - lamp.position_mm
+    np.testing.assert_allclose(lamp.axis, way / np.linalg.norm(way), atol=1e-12)
+    assert lamp.intensity_mw_sr == pytest.approx(14.0)
+    nearest = Rig.from_mapping({"cameras": [CAMERA], "lights": [{**plain, "aim_mm": "nearest_eye"}]}).build().lights[0]
+    gap = np.array([0.0, -31.75, 0.0]) - nearest.position_mm
+    np.testing.assert_allclose(nearest.axis, gap / np.linalg.norm(gap), atol=1e-12)
+    with pytest.raises(InputError, match="has no outline"):
+        Rig.from_mapping({"cameras": [CAMERA], "lights": [{**plain, "mirror": small(np.array([200.0, 150.0]), 9.0)}]})

@@ -84,6 +84,7 @@ class MirrorImages:
         further: requested images of higher orders.
         nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where not needed.
         in_lenses: images in worn lenses.
+        ghosts: ghosts of the first images, by the back of a mirror's glass; empty without.
     """
 
     job: RenderJob
@@ -93,6 +94,7 @@ class MirrorImages:
     further: dict[int, list[Image]]
     nearness: Floats
     in_lenses: list[Image]
+    ghosts: list[Image]
 
     @classmethod
     def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
@@ -110,8 +112,9 @@ class MirrorImages:
         key = eye.worn, lamps, job.camera, job.anchor_mm.tobytes()
         mirrored = _KNOWN.get(key, lambda: lens_reflections(scene, eye.worn, lamps, job.anchor_mm)) if eye.worn else []
         return cls(
-            job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness, in_lenses=mirrored
-        )
+            job=job, lamps=lamps, scene=scene, first=first, further=further, nearness=nearness, in_lenses=mirrored,
+            ghosts=scene.ghosts(lamps, first.parts, job.sensor.psf_sigma_px) if 1 in job.purkinje else [],
+        )  # fmt: skip
 
     def seen(self, place: Background | RegionScene, blur: Blur, share: float = 1.0) -> tuple[Mirrored, list[Shine]]:
         """Return the visible parts of the images in posed surroundings, and their contribution to the blurred image.
@@ -133,6 +136,10 @@ class MirrorImages:
             shines += [
                 Shine(glint.spots, share, size) for glint, size in zip(further.get(order, glints), sizes, strict=True)
             ]
+        ghosts = self.scene.seen(self.ghosts, clear) if self.ghosts else []
+        shines += [
+            Shine(ghost.spots, share, blur.of_image(near)) for ghost, near in zip(ghosts, self.nearness, strict=False)
+        ]
         in_lenses = self.scene.seen(self.in_lenses, clear) if self.in_lenses else []
         shines += [Shine(defocused(glint.spots, blur.subject_px), share, 0.0, True) for glint in in_lenses]
         others = tuple((order, glint_table(found[:count])) for order, found in further.items())

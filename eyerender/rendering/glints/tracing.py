@@ -42,6 +42,7 @@ from ..hits.meshes import MirrorPoints, SurfaceMesh
 from .cutdiscs import POINT, Nodes, cut_nodes, quadrature, rim
 
 _PARALLAX_MM = 0.05
+_GHOST_STEPS = 4  # each reduces the error by the ratio of the glass's thickness to the distance
 _MAP_ERROR = 1e-3  # share of the extent of a lamp's image
 
 Visibility = Callable[[Floats, Floats], Bools]
@@ -171,6 +172,28 @@ class GlintScene:
             for k, image in zip(more, finely, strict=True):
                 images[k] = join_rows([image, take_rows(images[k], slice(-_ON_RIM, None))])
         return LampImages(images, counts)
+
+    def ghosts(self, lights: Sequence[Lamp], images: Sequence[Image], sigma_px: float) -> list[Image]:
+        """Compute the images of lamps by way of the back of the mirror's glass; empty without one.
+
+        The camera is where light of the middle of the image seems to go (`rig.mirror`).
+        """
+        camera, out = self.camera, []
+        if camera.mirror is None or not camera.mirror.has_ghosts:
+            return []
+        for lamp, image in zip(lights, images, strict=True):
+            way = np.zeros(3)
+            for _ in range(_GHOST_STEPS if image.there.any() else 0):
+                seen = rotated(camera.R, image.exit_mm[image.there].mean(axis=0)) + camera.t
+                node = camera.mirror.ghost_node(seen)
+                way = seen - node
+                moved = replace(self, camera=replace(camera, t=frozen(camera.t - node)))
+                image = moved.images([lamp], sigma_px).parts[0]
+                if not image.there.any():
+                    break
+            held = way.any() and camera.mirror.holds(way)
+            out.append(replace(image, energy=image.energy * (camera.mirror.ghost_share(way) if held else 0.0)))
+        return out
 
     def glints(self, lights: Sequence[Lamp], images: LampImages, clear: Visibility) -> list[Glint]:
         """Compute the glints of lamps from their images, as finely as their edges require."""

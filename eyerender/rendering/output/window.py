@@ -181,7 +181,7 @@ class RawFrame(ArrayValue):
             picture = stray.scattered(picture, *seen)
         else:
             picture = stray.scattered_around(picture, self._around(self.around, exposed.glints), *seen)
-        beyond = job.camera.without_rays(job.window)
+        beyond = job.camera.dark(job.window)
         if beyond is not None:
             picture = np.where(beyond, np.float32(0), picture)
         return np.asarray(picture * np.float32(exposure.radiance_to_irradiance(job.sensor))), reflections
@@ -206,6 +206,8 @@ class RawFrame(ArrayValue):
 
 def _framed(picture: Singles, lens: Lens, camera: PinholeCamera, window: Window) -> Singles:
     """Compute the image (height, width) of a window behind fall-off, vignetting and openings; the input may change."""
+    if camera.mirror is not None:
+        picture *= np.float32(camera.mirror.reflectance)
     if camera.relative_illumination is not None:
         picture *= camera.illumination(window).astype(np.float32)
     if lens.vignetting > 0:
