@@ -50,12 +50,13 @@ def sweep(
     wanted = SweepSpec.load(spec)
     if people is not None:
         wanted = wanted.replaced("--people", {"people": people})
-    allowed = None if tolerances is None else Tolerances.load(tolerances)
+    if tolerances is not None:
+        wanted = wanted.replaced("--tolerances", {"tolerances": Tolerances.load(tolerances).to_mapping()})
     how = SweepRun(workers=workers, part=part, overwrite=overwrite)
     try:
         scene = wanted.base(spec.parent)
         with progress("sweep") as steps:
-            found = run_sweep(wanted, scene, output, how, tolerances=allowed, progress=steps, say=say)
+            found = run_sweep(wanted, scene, output, how, progress=steps, say=say)
     except InputError as error:
         raise error.placed(source=str(spec)) from None
     emit(found, _text(found, output / REPORT), json)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats
+from ..base.arrays import Bools, Floats
 from ..optics.transforms import direction_of
 from ..rig.rig import RigGeometry
 from ..scene import Scene
@@ -82,7 +82,7 @@ def field_share(scene: Scene, survey: RigPopulation) -> float:
     return float(_in_a_picture(scene.rig, places + turned).mean())
 
 
-def _in_a_picture(rig: RigGeometry, points_mm: Floats) -> Floats:
+def _in_a_picture(rig: RigGeometry, points_mm: Floats) -> Bools:
     """Return which pupils at points (..., 3) mm are whole in the picture of a camera."""
     seen = np.zeros(points_mm.shape[:-1], dtype=bool)
     for camera in rig.cameras:
@@ -95,4 +95,4 @@ def _in_a_picture(rig: RigGeometry, points_mm: Floats) -> Floats:
 
 def _place_of(scene: Scene) -> Floats:
     side = scene.spec.subject.eyes[0]
-    return scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0])
+    return np.asarray(scene.eye_position_mm(side) + np.array(scene.spec.subject.head_positions_mm[0]))

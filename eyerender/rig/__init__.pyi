@@ -1,6 +1,5 @@
 from .camera import CalibrationFile as CalibrationFile
 from .camera import CameraCalibration as CameraCalibration
-from .camera import Mirror as Mirror
 from .camera import PinholeCamera as PinholeCamera
 from .exposure import electrons as electrons
 from .exposure import expose as expose
@@ -14,6 +13,7 @@ from .imaging import Star as Star
 from .imaging import Sun as Sun
 from .light import Lamp as Lamp
 from .light import LedRing as LedRing
+from .mirror import Mirror as Mirror
 from .mount import IpdAdjustment as IpdAdjustment
 from .mount import Mount as Mount
 from .obstacles import Obstacle as Obstacle

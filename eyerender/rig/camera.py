@@ -43,7 +43,8 @@ from .distortion import (
     is_imaged,
     undistort,
 )
-from .mirror import Mirror, MirrorPlate
+from .mirror import Mirror as Mirror
+from .mirror import MirrorPlate
 from .opencv import read_opencv
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
@@ -638,8 +639,8 @@ class PinholeCamera(ArrayValue):
         if self.mirror is None or self.mirror.corners_mm is None:
             return beyond
         v, u = np.mgrid[y0 : y0 + height, x0 : x0 + width]
-        beside = self.beside_mirror(np.stack([u, v], axis=-1).astype(float))
-        return beside if beyond is None else beyond | beside
+        beside = ~self.mirror.holds(self.rays(np.stack([u, v], axis=-1)) @ self.R.T)
+        return beside if beyond is None else np.asarray(beyond | beside)
 
     def in_image(self, pixels: ArrayLike) -> Bools:
         """Return whether pixels (..., 2) lie on the sensor, which ends half a pixel beyond its outer pixel centres."""

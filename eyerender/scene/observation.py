@@ -705,12 +705,13 @@ def concatenate(parts: Iterable[Observations]) -> Observations:
         return replace(groups[0], **columns)
 
     joint: dict[str, Any] = {name: joined(name) for name in ("index", "pose", "pupil", "glints")}
-    further: list[tuple[str, type[GlintFeatures]]]
-    further = [("lens_glints", LensGlintFeatures), ("ghost_glints", GlintFeatures)]
+    further: tuple[tuple[str, type[GlintFeatures]], ...]
+    further = ("lens_glints", LensGlintFeatures), ("ghost_glints", GlintFeatures)
     for name, kind in further:
         if any(getattr(b, name) is not None for b in batches):
-            nothing = [kind(status=np.zeros((len(b), 0), np.int8)) for b in batches]
-            batches = [replace(b, **{name: getattr(b, name) or none}) for b, none in zip(batches, nothing, strict=True)]
+            own = [getattr(b, name) or kind(status=np.zeros((len(b), 0), np.int8)) for b in batches]
+            changes: list[dict[str, Any]] = [{name: one} for one in own]
+            batches = [replace(b, **change) for b, change in zip(batches, changes, strict=True)]
             joint[name] = joined(name)
     return Observations(**joint)
 

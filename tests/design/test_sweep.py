@@ -14,7 +14,6 @@ from eyerender.apps.sweeps.spec import SweepSpec, SweptPlaces, layouts_of
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.design.eyebox import sharp_depth_mm
-from eyerender.design.tolerances import Tolerances
 from eyerender.rig.defocus import confusion_px
 
 SWEEP: dict[str, Any] = {
@@ -116,10 +115,13 @@ def test_a_long_lens_pays_with_depth_and_field_and_tolerances_count(tmp_path):
     spec = SweepSpec.from_mapping({
         "format": 1, "scene": "headset", "people": 1, "sweep": {"cameras": [{"focal_length_px": [720, 2400]}]},
     })  # fmt: skip
-    scene = spec.base(Path())
+    scene, tolerances = spec.base(Path()), tmp_path / "tolerances.yaml"
     one = {"part": "camera", "quantity": "rotation_deg", "sd": 0.2, "when": "after"}
-    given = Tolerances.from_mapping({"tolerances": [one]})
-    short, long = run_sweep(spec, scene, tmp_path / "out", SweepRun(workers=1), tolerances=given)["rows"]
+    tolerances.write_text(json.dumps({"format": 1, "tolerances": [one]}))
+    (tmp_path / "sweep.yaml").write_text(spec.to_yaml())
+    out = ["-o", str(tmp_path / "out"), "--workers", "1"]
+    assert run(["sweep", str(tmp_path / "sweep.yaml"), "--tolerances", str(tolerances), *out]) == 0
+    short, long = json.loads((tmp_path / "out/summary.json").read_text())["rows"]
     assert long["noise_deg"] < short["noise_deg"]
     assert long["sharp_depth_mm"] < short["sharp_depth_mm"]
     assert long["field"] < 0.9
@@ -130,7 +132,6 @@ def test_a_long_lens_pays_with_depth_and_field_and_tolerances_count(tmp_path):
         run_sweep(spec, scene, tmp_path / "out", SweepRun(workers=1))
     file = tmp_path / "wrong.yaml"
     file.write_text("format: 1\ntolerances:\n- {part: led, number: 9, quantity: position_mm, sd: 1, when: after}\n")
-    (tmp_path / "sweep.yaml").write_text(spec.to_yaml())
     assert run(["sweep", str(tmp_path / "sweep.yaml"), "-o", str(tmp_path / "no"), "--tolerances", str(file)]) == 2
     assert not (tmp_path / "no").exists()
 

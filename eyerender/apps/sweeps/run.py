@@ -31,7 +31,7 @@ from ...design.eyebox import eye_box_mm, eye_box_of, field_share, sharp_depth_mm
 from ...design.noise import FeatureNoise, sensor_noise
 from ...design.people import RigPopulation, figures_of, sites_seen
 from ...design.safety import eye_exposure
-from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
+from ...design.tolerances import UNIT_PEOPLE, of_this_eye, tolerated
 from ...design.unknowns import Unknowns
 from ...folders.outfolder import clear, refuse_non_empty
 from ...gaze.likelihood import GLINT_PX, OUTLINE_PX
@@ -69,7 +69,6 @@ def run_sweep(
     output: str | Path,
     how: SweepRun = SweepRun(),
     *,
-    tolerances: Tolerances | None = None,
     progress: Progress | None = None,
     say: Say = lambda _text: None,
 ) -> dict[str, Any]:
@@ -80,7 +79,6 @@ def run_sweep(
         scene: the sweep's base scene (`spec.base`).
         output: the folder, which may hold a part of the same sweep.
         how: options of the run.
-        tolerances: deviations of units from each layout; for the first `UNIT_PEOPLE`.
         progress: called with (layouts done, layouts of this run, what).
         say: called with a message for each problem that does not end the run.
 
@@ -89,17 +87,15 @@ def run_sweep(
     """
     folder = Path(output)
     layouts = layouts_of(spec, scene)
-    if tolerances is not None:
-        _check_tolerances(tolerances, layouts)
-    digest = _digest(spec, scene, tolerances)
-    settings = {"schema": SCHEMA, "sweep": digest, "layouts": len(layouts), "spec": spec.to_mapping()}
+    _check_tolerances(spec, layouts)
+    settings = {"schema": SCHEMA, "sweep": _digest(spec, scene), "layouts": len(layouts), "spec": spec.to_mapping()}
     _claim(folder, settings, how.overwrite)
     k, n = how.part
     with run_lock(folder, how.part, say):
         mine = [layout for layout in layouts if layout.number % n == k - 1]
         missing = [layout for layout in mine if not _path(folder, layout.number).is_file()]
         done = len(mine) - len(missing)
-        for number, record in _evaluated(spec, missing, how.workers, tolerances):
+        for number, record in _evaluated(spec, missing, how.workers):
             write_json(_path(folder, number), {"schema": LAYOUT_SCHEMA, **record})
             done += 1
             notify(progress, done, len(mine), "layouts")
@@ -114,27 +110,23 @@ def _path(folder: Path, number: int) -> Path:
     return folder / LAYOUTS / f"{number:06d}.json"
 
 
-def _check_tolerances(tolerances: Tolerances, layouts: Sequence[RigLayout]) -> None:
+def _check_tolerances(spec: SweepSpec, layouts: Sequence[RigLayout]) -> None:
     """Check that tolerances name parts of the layouts; an LED that is chosen among places has no fixed number.
 
     Raises:
         InputError: naming the tolerance that does not fit.
     """
-    scene = Scene.of(SceneSpec.from_mapping(layouts[0].scene))
-    try:
-        of_this_eye(scene, tolerances)
-    except InputError as error:
-        raise error.placed(source="--tolerances") from None
-    for k, one in enumerate(tolerances.tolerances):
-        if one.part == "led" and one.number != "all" and layouts[0].lights < len(scene.rig.lights):
-            reason = "LEDs are chosen among places; write all"
-            raise InputError(reason, source="--tolerances", path=f"tolerances.{k}.number")
+    if spec.tolerances is None:
+        return
+    scene, fewest = Scene.of(SceneSpec.from_mapping(layouts[0].scene)), min(layout.lights for layout in layouts)
+    of_this_eye(scene, spec.tolerances)
+    for k, one in enumerate(spec.tolerances.tolerances):
+        if one.part == "led" and one.number != "all" and fewest < len(scene.rig.lights):
+            raise InputError("LEDs are chosen among places; write all", path=f"tolerances.{k}.number")
 
 
-def _digest(spec: SweepSpec, scene: Scene, tolerances: Tolerances | None) -> str:
+def _digest(spec: SweepSpec, scene: Scene) -> str:
     content = {"spec": spec.to_mapping(), "scene": scene.located().to_mapping()}
-    if tolerances is not None:
-        content["tolerances"] = tolerances.to_mapping()
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -164,20 +156,19 @@ def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
 
 
 def _evaluated(
-    spec: SweepSpec, layouts: Sequence[RigLayout], workers: int | None, tolerances: Tolerances | None
+    spec: SweepSpec, layouts: Sequence[RigLayout], workers: int | None
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield results of layouts as worker processes finish them."""
     count = min(workers or os.cpu_count() or 1, len(layouts))
     if count <= 1:
-        yield from ((layout.number, evaluate(spec, layout, tolerances)) for layout in layouts)
+        yield from ((layout.number, evaluate(spec, layout)) for layout in layouts)
         return
     todo = iter(layouts)
     with process_pool(count) as pool:
         running: dict[Future[dict[str, Any]], int] = {}
 
         def start(some: int) -> None:
-            for layout in islice(todo, some):
-                running[pool.submit(evaluate, spec, layout, tolerances)] = layout.number
+            running.update({pool.submit(evaluate, spec, layout): layout.number for layout in islice(todo, some)})
 
         start(2 * count)
         while running:
@@ -187,7 +178,7 @@ def _evaluated(
             start(len(ready))
 
 
-def evaluate(spec: SweepSpec, layout: RigLayout, tolerances: Tolerances | None = None) -> dict[str, Any]:
+def evaluate(spec: SweepSpec, layout: RigLayout) -> dict[str, Any]:
     """Evaluate one layout: choose its LEDs, and compute bound, dropout, exposure and units over the population."""
     whole = Scene.of(SceneSpec.from_mapping(layout.scene))
     scene = whole.of_first_eye()
@@ -219,19 +210,17 @@ def evaluate(spec: SweepSpec, layout: RigLayout, tolerances: Tolerances | None =
         "sharp_depth_mm": sharp_depth_mm(scene, spec.sharp_px),
         "field": field_share(scene, survey),
         **_exposure(scene),
-        **_units(whole, scene, survey, tolerances, spec.people),
+        **_units(whole, scene, survey, spec),
     }
 
 
-def _units(
-    whole: Scene, scene: Scene, survey: RigPopulation, tolerances: Tolerances | None, people: int
-) -> dict[str, Any]:
+def _units(whole: Scene, scene: Scene, survey: RigPopulation, spec: SweepSpec) -> dict[str, Any]:
     """Compute what tolerances cost, and the median user's 95th-percentile error with drawn units."""
-    if tolerances is None:
+    if spec.tolerances is None:
         return {"tolerances": None, "units": None, "units_deg": None}
     weights = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=scene.rig)
-    own = of_this_eye(whole, tolerances)
-    found = tolerated(survey, tolerances, own, weights, min(UNIT_PEOPLE, people))
+    own = of_this_eye(whole, spec.tolerances)
+    found = tolerated(survey, spec.tolerances, own, weights, min(UNIT_PEOPLE, spec.people))
     return {**found, "units_deg": found["units"]["U50E95"]}
 
 

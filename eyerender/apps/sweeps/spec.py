@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from ...base.arrays import Floats
 from ...base.errors import InputError
 from ...base.spec import FileSpec, NonNegative, Positive, Spec, Vec3
+from ...design.tolerances import Tolerances
 from ...rig.light import MAX_LIGHTS
 from ...scene import Scene, load_scene
 from ...scene.people import Population
@@ -116,6 +117,9 @@ class SweepSpec(FileSpec):
         default=0.0, description="additional standard deviation of their distance: eye relief of a headset"
     )
     sharp_px: Positive = Field(default=1.0, description="largest circle of confusion within the sharp depth")
+    tolerances: Tolerances | None = Field(
+        default=None, description="deviations of units from each layout, as in a file of tolerances; default: none"
+    )
     sweep: Sweep = Field(description="values to vary")
 
     def people_of(self) -> Population:
