@@ -36,6 +36,7 @@ from ..region.contour import inner_margins
 from ..region.globe import Globe
 from ..region.lids import EDGE_MM, LOWER_TILT_DEG, margin_width_mm
 from ..rig.camera import PinholeCamera
+from ..rig.rig import RigGeometry
 from ..scene import Scene
 from ..scene.people import Population
 from ..scene.spec import SceneSpec
@@ -224,7 +225,8 @@ def cases_of(survey: RigPopulation, count: int) -> Iterator[tuple[Case, Floats |
 def surveyed(survey: RigPopulation, count: int) -> Iterator[tuple[Scene, Case, Floats | None]]:
     """Yield the same with the scene whose rig is set to these people."""
     for some in _groups(people_of(survey, 0, count)[0]):
-        yield some[0].scene, _case(survey, some), _openings(survey, some) if survey.lids else None
+        scene = some[0].scene
+        yield scene, _case(survey, scene.rig, some), _openings(survey, some) if survey.lids else None
 
 
 def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
@@ -238,7 +240,8 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
         raise InputError("no eye of this population is physically possible", path="population")
     parts: list[list[SiteInformation]] = [[] for _ in noises]
     for one in people:
-        case, rig = _case(survey, [one]), one.scene.rig
+        rig = one.scene.rig
+        case = _case(survey, rig, [one])
         instants, theta = case.instants.take(CALIBRATION_CELLS), case.theta[CALIBRATION_CELLS]
         openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
         numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
@@ -309,7 +312,8 @@ def _nobody(refused: list[int]) -> Figures:
 
 def _of_group(survey: RigPopulation, noise: FeatureNoise, people: list[Someone]) -> Figures:
     """Compute figures of a few people at once, camera by camera."""
-    case, rig = _case(survey, people), people[0].scene.rig
+    rig = people[0].scene.rig
+    case = _case(survey, rig, people)
     i, m = len(case.theta), len(rig.lights)
     matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
     glints, lost = np.zeros((i, m), dtype=bool), np.zeros((i, len(LOST)), dtype=np.int64)
@@ -338,7 +342,7 @@ def _of_group(survey: RigPopulation, noise: FeatureNoise, people: list[Someone])
     )
 
 
-def _case(survey: RigPopulation, people: list[Someone]) -> Case:
+def _case(survey: RigPopulation, rig: RigGeometry, people: list[Someone]) -> Case:
     """Create a case of all directions of some people, one instant each; the camera is set later."""
     eyes = stacked_eyes([one.eye for one in people])
     cells = GRID * GRID
@@ -347,8 +351,7 @@ def _case(survey: RigPopulation, people: list[Someone]) -> Case:
     theta[:, [AZIMUTH, ELEVATION]] = np.radians(np.tile(survey.directions_deg, (len(people), 1)))
     theta[:, PUPIL] = diameters_mm(eyes)[person]
     places = np.array([one.place_mm for one in people])[person]
-    camera, rig = np.zeros(len(person), np.int64), people[0].scene.rig
-    views = Views(eyes=eyes, person=person, position_mm=places, camera=camera, rig=rig)
+    views = Views(eyes=eyes, person=person, position_mm=places, camera=np.zeros(len(person), np.int64), rig=rig)
     nowhere = np.full((len(person), 3), np.nan)
     return Case(views=views, instant=np.arange(len(person)), instants=views, theta=theta, target_mm=nowhere)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.apps.sweeps.run import GOALS, SweepRun, pareto, run_sweep
+from eyerender.apps.sweeps.run import GOALS, SweepRun, evaluate, pareto, run_sweep
 from eyerender.apps.sweeps.spec import SweepSpec, SweptPlaces, layouts_of
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
@@ -142,3 +142,16 @@ def test_the_sharp_depth_ends_where_the_circle_of_confusion_reaches_the_limit(tm
     depth = np.linspace(40.0, 50.0, 100_001)
     disc = confusion_px(scene.spec.lens, scene.rig.cameras[0], scene.spec.sensor, depth)
     assert found == pytest.approx(np.ptp(depth[disc <= 1.0]), abs=2e-4)  # two steps of the depth
+
+
+def test_noise_falls_with_the_power_of_the_leds():
+    place = {"curve_mm": [[28, -45, 12], [28, -18, -12]], "count": 3}
+    spec = SweepSpec.from_mapping({
+        "format": 1, "scene": "headset", "people": 1,
+        "sweep": {"lights": {"places": place, "intensity_mw_sr": [0.05, 0.1, 0.2]}},
+    })  # fmt: skip
+    rows = [evaluate(spec, layout) for layout in layouts_of(spec, spec.base(Path()))]
+    noise = [row["noise_deg"] for row in rows]
+    assert noise == sorted(noise, reverse=True)
+    assert noise[0] > 1.2 * noise[2]  # at least: with shot noise alone it would be 2
+    assert len({row["dropout"] for row in rows}) == 1
