@@ -57,8 +57,8 @@ def main() -> int:
         size = RigSize(people=options.people, sample=0, seed=seed, workers=1)
         for one in compare_rigs(scenes, er.Population("adults"), size)["comparisons"]:
             if one["rigs"][0] == "headset":
-                values = (one["difference"], one["low"], one["high"])
-                found.setdefault((one["rigs"][1], one["quantity"]), []).append(values)
+                interval = (one["difference"], one["low"], one["high"])
+                found.setdefault((one["rigs"][1], one["quantity"]), []).append(interval)
         print(f"seed {seed} of {seeds}", file=sys.stderr, flush=True)
     for (other, quantity), values in found.items():
         difference, low, high = np.array(values, dtype=float).T
