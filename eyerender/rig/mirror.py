@@ -23,7 +23,6 @@ from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.spec import NonNegative, Spec, Vec3
 from ..optics.interface import fresnel
 
-Reflectance = Annotated[float, Field(gt=0, le=1)]
 _STEPS = 30  # of the fixed point; each reduces the error by the ratio of the plate's thickness to the distance
 
 
@@ -37,7 +36,9 @@ class Mirror(Spec):
         description="corners in order around, in the world, beside which a camera sees nothing in the mirror; they are "
         "moved into the plane along `normal`; default: no edges",
     )
-    reflectance: Reflectance = Field(default=1.0, description="share of the light that the plane mirrors")
+    reflectance: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=1.0, description="share of the light that the plane mirrors"
+    )
     thickness_mm: NonNegative = Field(
         default=0.0, description="thickness of the glass behind the plane, whose back mirrors ghosts; 0: no glass"
     )

@@ -360,8 +360,7 @@ class Observations(ArrayValue):
             if name is not None and name not in EYES:
                 reader.refuse(k, "eye", "must be 'right' or 'left'")
                 eye[k] = None
-        head = reader.array("head_mm", (3,))
-        reason = reader.texts("pupil.reason")
+        head, reason = reader.array("head_mm", (3,)), reader.texts("pupil.reason")
         centre, semi_axes = reader.array("pupil.centre_px", (2,)), reader.array("pupil.semi_axes_px", (2,))
         placed = np.asarray(np.isfinite(centre).all(axis=1))
         status = reader.statuses("pupil.status", reason, placed)

@@ -147,6 +147,8 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append("The camera's lens distortion is left out.")
     if job.flip:
         notes.append("The picture is the one before the camera's flip.")
+    if job.camera.mirror is not None:
+        notes.append("The mirror's outline, reflectance and ghosts are left out.")
     if any(lamp.radius_mm > 0 and lamp.lobe_exponent != 1 for lamp in job.lights):
         notes.append("Lamps with a lobe other than cos^1 are shown as Lambertian discs.")
     if any(lamp.radius_mm == 0 for lamp in job.lights):
