@@ -123,13 +123,12 @@ def test_a_mirror_that_turns_moves_the_picture_twice(survey):
     del data["rig"]["obstacles"]
     data["rig"]["cameras"][0]["mirror"] = {"point_mm": [20, -31.5, -10], "normal": [1, 0, -0.3]}
     scene = er.Scene.of(SceneSpec.from_mapping(data))
-    camera = scene.spec.rig.cameras[0]
     for axis in (0, 1):
-        turned = tolerances._mirrored(camera, "rotation_deg", axis, 0.1)
+        turned = tolerances._with_mirror(scene, 0, "rotation_deg", axis, 0.1).cameras[0]
         change = turned.R @ scene.rig.cameras[0].R.T
         angle = np.degrees(np.arccos(np.clip((np.trace(change) - 1) / 2, -1, 1)))
         assert angle == pytest.approx(0.2, rel=1e-4)  # two reflections at planes that differ by e turn by 2 e
-    shifted = tolerances._mirrored(camera, "position_mm", 0, 0.5)
+    shifted = tolerances._with_mirror(scene, 0, "position_mm", 0, 0.5).cameras[0]
     assert np.linalg.norm(shifted.nodal_point_mm - scene.rig.cameras[0].nodal_point_mm) == pytest.approx(1.0)
 
 

@@ -160,7 +160,8 @@ def test_mirrors_that_cannot_be_are_refused(mirror, reason):
         Camera.from_mapping({**CAMERA, "mirror": mirror}).build()
 
 
-GLASS = {**MIRROR, "reflectance": 0.4, "thickness_mm": 1.5, "index": 1.5}
+THICKNESS_MM, INDEX = 1.5, 1.5
+GLASS = {**MIRROR, "reflectance": 0.4, "thickness_mm": THICKNESS_MM, "index": INDEX}
 
 
 def test_ghosts_are_displaced_by_the_plates_formula_and_reach_their_lamps():
@@ -175,7 +176,7 @@ def test_ghosts_are_displaced_by_the_plates_formula_and_reach_their_lamps():
         found.glints.xy_px, er.trace(scene(mirror=MIRROR).with_(gaze_deg=[[0, 0]])).glints.xy_px
     )
     normal, start = np.array(MIRROR["normal"]) / np.linalg.norm(MIRROR["normal"]), np.array(CAMERA["position_mm"])
-    point, n, t = np.array(MIRROR["point_mm"]), GLASS["index"], GLASS["thickness_mm"]
+    point, n, t = np.array(MIRROR["point_mm"]), INDEX, THICKNESS_MM
     normal = normal * np.sign((start - point) @ normal)  # towards camera and eye
 
     def reflected(way, axis):
