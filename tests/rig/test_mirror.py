@@ -235,6 +235,7 @@ def test_nothing_is_seen_beside_the_outline():
     np.testing.assert_array_equal(found.glints.ok[0], inside)
     assert found.glints.reason[0, 1] == "beside the mirror"
     assert found.pupil.reason[0].startswith("beside the mirror")
+    assert scene(mirror=mirror).rig == scene(mirror=mirror).rig != scene(mirror=MIRROR).rig
     dark = scene(mirror=mirror).rig.cameras[0].dark((0, 0, 400, 300))
     v, u = np.nonzero(~dark)
     np.testing.assert_allclose([u.mean(), v.mean()], glints[0], atol=0.5)  # whole pixels
