@@ -24,7 +24,7 @@ from eyerender.apps.rigs.compare import compare_rigs
 from eyerender.apps.rigs.options import RigSize
 
 SEEDS, LEAST = 40, 36
-PEOPLE = 60
+PEOPLE = 50
 
 
 def rigs() -> list[er.Scene]:
