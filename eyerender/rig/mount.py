@@ -57,6 +57,7 @@ class Mount(Spec):
         moved = frozen(body.vertices @ rotation.T + offset)
         return replace(body, vertices=moved, normals=frozen(body.normals @ rotation.T))
 
+
 class IpdAdjustment(Spec):
     """A mechanism that moves the parts of each eye (those whose `eyes` names it alone) to the wearer's eyes, along y.
 

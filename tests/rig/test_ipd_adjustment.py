@@ -43,7 +43,7 @@ def test_a_camera_takes_its_mirror_along_and_the_mount_comes_last():
     }  # fmt: skip
     rig = er.load_scene("headset").with_(changes).spec.rig
     moved, still = rig.build(69.0), rig.build(63.0)
-    turn = rig.model_copy(update={"ipd_adjust": None}).mount._motion()[0]
+    turn = rig.model_copy(update={"ipd_adjust": None}).mount.motion()[0]
     shift = moved.cameras[0].nodal_point_mm - still.cameras[0].nodal_point_mm
     np.testing.assert_allclose(shift, turn @ [0.0, -3.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(moved.lights[0].position_mm, still.lights[0].position_mm)  # it serves both eyes

@@ -75,7 +75,9 @@ class Preparation:
         parts: dict[str, Any] = {}
         part, linear, lights = "visible_fraction", self.encoding == "linear", self.lights
         try:
-            shown = part_of(part, line, picture, linear=linear, lights=lights) if self.reads_labels else np.full(2, np.nan)
+            shown = (
+                part_of(part, line, picture, linear=linear, lights=lights) if self.reads_labels else np.full(2, np.nan)
+            )
             for part in self.parts:
                 parts[part] = part_of(part, line, picture, linear=linear, lights=lights)
             part, window, mask = "mask", line["window_px"], parts.get("mask")
