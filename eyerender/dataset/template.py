@@ -41,7 +41,7 @@ IDENTITY = (
     "subject.contact_lens", "eye_parameters",
 )  # fmt: skip
 # Exceptions, which change with every frame.
-PASSING = ("region.blink",)
+PASSING = ("region.blink", "region.squint", "region.wide")
 # Values of the eye, which never change between frames, whatever the draw says.
 FIXED_IDENTITY = ("eye.model", "eye.margin", "eye_parameters")
 _BLOCK = 256

@@ -24,6 +24,8 @@ from ..eye.model import EyeModel
 from ..optics.ellipse import fit_ellipse_direct
 from ..optics.transforms import rotated
 from ..region.limbus import lower
+from ..region.mesh import lid_margins
+from ..rendering.records.job import globe_of
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..scene.observation import EYES, Observations
 from ..scene.parts import IRIS, PUPIL
@@ -96,8 +98,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
             for k, (glint, reason) in enumerate(zip(known["glints"], done.glint_reasons, strict=True))
         ],
         "lid_margins_px": done.lid_margins_px,
-        "lid_opening": None,
-        **{key: known[key] for key in ("space", "globe_radius_mm", "pose", "camera", "lights_mm")},
+        **{key: known[key] for key in ("lid_opening", "space", "globe_radius_mm", "pose", "camera", "lights_mm")},
         "failed_paths": int(done.failed_paths),
     }
 
@@ -114,6 +115,7 @@ def known_labels(scene: RenderableScene, observations: Observations, view: EyeIn
         },
         "iris": {"amodal": iris_outline(scene, view)},
         "glints": _glints(scene, observations, view),
+        "lid_opening": lid_opening(scene, view),
         "space": _space(scene, observations, view, camera),
         "globe_radius_mm": float(view.eye.sclera.radius_mm),
         "pose": {"rotation": view.M.tolist(), "translation_mm": view.t.tolist()},
@@ -134,6 +136,25 @@ def eye_present(camera: PinholeCamera, view: EyeInWindow | EyeImage) -> bool:
     x, y = camera.project(centre[None])[0][0] - view.window[:2]
     aside = np.maximum([-x, -y], [x - view.window[2] + 1, y - view.window[3] + 1])
     return bool(np.hypot(*np.maximum(aside, 0.0)) <= max(camera.K[0, 0], camera.K[1, 1]) * _REACH_MM / depth)
+
+
+def lid_opening(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[str, float | None] | None:
+    """Compute the arc between the lids (`LidMargins.opening_mm`) through the middle of the stop, and its share at rest.
+
+    It is None for a bare eye and for a head mesh. At rest, the person's own lids neither shut nor squint nor are wide,
+    and follow the same gaze.
+    """
+    region, person = scene.region, scene.spec.person
+    if region is None or region.head is not None:
+        return None
+    rest = region.with_lids()
+    if person is not None:  # a recipe may draw a fissure for each sample, beside the person's own
+        rest = rest.model_copy(update={"fissure": person.region().fissure})
+    globe = globe_of(view.eye, view.M, view.t - view.apex_mm)
+    y = float((rotated(view.M, view.eye.stop.centre_mm) + view.t - view.apex_mm)[1])
+    side = view.eye.side
+    now, before = (lid_margins(spec.of_side(side), globe).opening_mm(globe, y) for spec in (region, rest))
+    return {"mm": now, "share": now / before if before > 0 else None}
 
 
 def moments_ellipse(inside: Bools, window: Window) -> dict[str, Any]:

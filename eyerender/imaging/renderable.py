@@ -7,6 +7,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 from ..analytic.observer import Traceable, TraceableScene
 from ..eye.contact import ContactLens
 from ..eye.model import EyeModel
+from ..population.people import Person
 from ..region.anatomy import Region
 from ..region.look import Look
 from ..rig.camera import Window
@@ -29,6 +30,11 @@ class PictureSettings(Protocol):
     @property
     def eye(self) -> EyeSettings:
         """Settings of the eye model."""
+        ...
+
+    @property
+    def person(self) -> Person | None:
+        """The drawn person, if there is one."""
         ...
 
     @property

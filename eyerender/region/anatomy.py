@@ -23,15 +23,18 @@ source:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from ..base.spec import KeyProblem, Spec
 from .headspec import Head
 
 Share = Annotated[float, Field(ge=0, le=1)]
+MOVEMENTS = ("blink", "squint", "wide")
+"""Keys of a region by which the lids move."""
 
 
 def _number(default: float, low: float, high: float, text: str) -> Any:
@@ -168,6 +171,19 @@ class TearFilm(Spec):
     )
 
 
+class LidsBySide(Spec):
+    """A movement of the lids that differs between the eyes, such as a wink."""
+
+    right: Share = Field(default=0.0, description="of the right eye")
+    left: Share = Field(default=0.0, description="of the left eye")
+
+
+Movement = Annotated[
+    Annotated[Share, Tag("NumberSpec")] | Annotated[LidsBySide, Tag("SidesSpec")],
+    Discriminator(lambda value: "SidesSpec" if isinstance(value, Mapping | LidsBySide) else "NumberSpec"),
+]
+
+
 class Region(Spec):
     """The eye region of one subject. Without this key, a scene shows the bare eye in front of a matte background.
 
@@ -182,13 +198,21 @@ class Region(Spec):
     face: Face = Field(default=Face(), description="the face around the lids")
     skin: Skin = Field(default=Skin(), description="appearance of the skin at 850 nm")
     tears: TearFilm = Field(default=TearFilm(), description="the tear meniscus along both margins")
-    blink: Share = Field(default=0.0, description="closure of the lids, 0 open to 1 shut")
+    blink: Movement = Field(
+        default=0.0, description="closure of the lids, 0 open to 1 shut; a number, or `{right: .., left: ..}`"
+    )
+    squint: Movement = Field(
+        default=0.0, description="lower lid raised, 0 at rest to 1 straight between the canthi; like `blink`"
+    )
+    wide: Movement = Field(
+        default=0.0, description="upper lid raised above its rest, by up to 2.5 mm at 1 (chosen); like `blink`"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the hairs and the skin")
     head: Head | None = Field(default=None, description="your own head mesh instead of all of this")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        for name in ("blink", "fissure", "lids", "face") if self.head is not None else ():
+        for name in (*MOVEMENTS, "fissure", "lids", "face") if self.head is not None else ():
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(
                     f"{name}: cannot be combined with a head mesh, which does not move and has its own shape"
@@ -197,8 +221,24 @@ class Region(Spec):
             raise KeyProblem("skin.map", "cannot be combined with a head mesh, which has its own texture")
         return self
 
+    def moved(self, name: str) -> float:
+        """Return how far the lids of one side do one of `MOVEMENTS`, 0 to 1; see `of_side`."""
+        value = getattr(self, name)
+        if isinstance(value, LidsBySide):
+            raise ValueError(f"region.{name} differs between the eyes; take the region of one side first")
+        return float(value)
+
+    def with_lids(self, blink: float = 0.0) -> Self:
+        """Return the same person with lids that neither squint nor are opened wide."""
+        return self.model_copy(update={**dict.fromkeys(MOVEMENTS, 0.0), "blink": blink})
+
     def of_side(self, side: str) -> Self:
-        """Return the region of the right or left eye; brows may differ in height."""
+        """Return the region of the right or left eye; movements of the lids and heights of the brows may differ."""
+        own = {name: getattr(self, name) for name in MOVEMENTS}
+        own = {name: getattr(value, side) for name, value in own.items() if isinstance(value, LidsBySide)}
+        return (self.model_copy(update=own) if own else self)._brow_of(side)
+
+    def _brow_of(self, side: str) -> Self:
         if self.brow.asymmetry_mm == 0:
             return self
         half = 0.5 * self.brow.asymmetry_mm * (1 if side == "left" else -1)
@@ -215,10 +255,13 @@ class Region(Spec):
         return cls.from_mapping({**_draw(cls, (seed,), spread), "seed": seed, "blink": blink})
 
 
+_NOT_DRAWN = ("head", "map", "mascara", "squint", "wide")
+
+
 def _draw(kind: type[Spec], key: tuple[int, ...], spread: float) -> dict[str, object]:
     out: dict[str, object] = {}
     fields = [
-        (name, field) for name, field in sorted(kind.model_fields.items()) if name not in ("head", "map", "mascara")
+        (name, field) for name, field in sorted(kind.model_fields.items()) if name not in _NOT_DRAWN
     ]
     for i, (name, field) in enumerate(fields):
         if isinstance(field.annotation, type) and issubclass(field.annotation, Spec):

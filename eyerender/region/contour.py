@@ -7,7 +7,8 @@ temporal and +1 nasal; the height of a lid above or below the chord is
     h(a) = H (1 + a)^p (1 - a)^q / max,
 
 with its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle
-lies at an angle about the globe's centre that turns by `upper_follows` of the eye's elevation.
+lies at an angle about the globe's centre that turns by `upper_follows` of the eye's elevation. `wide` raises it, up to
+2.5 mm. `squint` raises the lower lid towards the chord, and a blink shuts both where the lower lid then is.
 
 In front of the globe, the contour lies on it. Beyond a polar angle of 51 (nasal) to 58 degrees (temporal) it leaves the
 globe along the tangent, which flattens towards the canthi.
@@ -30,6 +31,9 @@ from .globe import Globe
 COLUMNS = 176
 LATERAL, _MEDIAL, _VERTICAL = np.radians(58.0), np.radians(51.0), np.radians(62.0)
 _GAP_MM = 0.01
+_LEAST_MM = 1.0  # smallest height of the fissure except in a blink
+_FLAT_MM = -0.6  # highest middle of the lower margin, below the chord
+_WIDE_MM = 2.5  # highest rise of the upper margin's middle above its rest
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -44,7 +48,7 @@ class Contour(ArrayValue):
         normal: (n, 3) normal of the globe or its continuation.
         away: (n, 3) direction along the globe away from the fissure.
         along_lid: (n, 3) direction towards the nose.
-        openness: 1 for lids open as in straight gaze, 0 for closed ones.
+        openness: 1 for an upper lid as in straight gaze, 0 for closed lids, above 1 in upward gaze or wide.
     """
 
     angle: Floats
@@ -157,21 +161,23 @@ def _outline(spec: Region, radius_mm: float, elevation_rad: Floats, a: Floats, u
         at_rest = np.arcsin(np.clip(rest_mm / reach, -0.95, 0.95))
         return np.asarray(reach * np.sin(np.clip(at_rest + follows * elevation_rad, -0.8, 0.8)))
 
-    low = np.minimum(-height(f.lower_mm, -lids.lower_follows) - middle_z, -0.6)
-    high = np.maximum(height(f.upper_mm, lids.upper_follows) - middle_z, low + 1.0)
+    low = np.minimum(-height(f.lower_mm, -lids.lower_follows) - middle_z, _FLAT_MM)
+    high = height(f.upper_mm + _WIDE_MM * spec.moved("wide"), lids.upper_follows) - middle_z
+    high = np.maximum(high, low + _LEAST_MM)
     rest = f.upper_mm - middle_z
+    open_share = np.clip((high - low) / (rest - low), 0, 1.3)  # of the upper lid
+    low = low + spec.moved("squint") * (np.minimum(_FLAT_MM, high - _LEAST_MM) - low)
     # Closed lids meet near the place of the lower lid. A lower lid that is very low moves up to meet the other.
     shut = 0.92 * low + 0.08 * np.minimum(high, 0.0)
     shut = np.maximum(shut, -3.2 + 0.5 * (shut + 3.2))
     shape_up, shape_low, bay = _shapes(len(a), f.peak)
     closed = shut[..., None] * shape_low
-    b = spec.blink
+    b = spec.moved("blink")
     up = (1 - b) * high[..., None] * shape_up * bay + b * (closed + _GAP_MM * shape_up)
     down = (1 - b) * low[..., None] * shape_low * bay + b * (closed - _GAP_MM * shape_low)
     up = np.maximum(up, down + _GAP_MM * shape_up)
     z = chord[:, 1] + np.where(upper > 0, up, down)
-    openness = (1 - b) * np.clip((high - low) / (rest - low), 0, 1.3)
-    return np.stack([np.broadcast_to(chord[:, 0], z.shape), z], axis=-1), np.asarray(openness)
+    return np.stack([np.broadcast_to(chord[:, 0], z.shape), z], axis=-1), np.asarray((1 - b) * open_share)
 
 
 @lru_cache(maxsize=16)

@@ -40,6 +40,7 @@ _FAR_MM = (66.0, 58.0)
 _LID_ROWS = np.array([1, 2, 3, 4, 6, 8, 10, 12, 13, 14, 15, 16]) / 16
 _GROWTH = 4.0  # natural logarithm of the last row's width over that of the first one beyond the crease
 _JOINT_MM = 2.4
+_ROLL_MM = 0.7  # fullness below the lower lashes of an eye that squints (chosen)
 _SOFT_MM = 9.0
 _ON_GLOBE = (1.0, 0.8, 0.5, 0.2)  # share of the globe's normal in those of the conjunctiva's first rows
 
@@ -185,9 +186,10 @@ def _conjunctiva(spec: Region, globe: Globe, c: Contour) -> Floats:
     rows = reach + u * (c.point - reach)
     # The plica is a low crescent on the globe, the caruncle a mound beside it.
     s = u[..., 0]
-    size = step(c.along, 0.66, 0.9)[None, :] * (1 - spec.blink)
+    blink = spec.moved("blink")
+    size = step(c.along, 0.66, 0.9)[None, :] * (1 - blink)
     plica = 0.16 * np.exp(-(((s - 0.34) / 0.22) ** 2)) * size
-    caruncle = 1.2 * np.exp(-(((s - 0.6) / 0.2) ** 2)) * step(c.along, 0.86, 0.99)[None, :] * (1 - 0.6 * spec.blink)
+    caruncle = 1.2 * np.exp(-(((s - 0.6) / 0.2) ** 2)) * step(c.along, 0.86, 0.99)[None, :] * (1 - 0.6 * blink)
     rows = rows + (plica + caruncle)[..., None] * c.normal
     # Long pieces are chords of the globe (0.7 of its radius for the cornea), so the points are raised until their
     # midpoints are outside too.
@@ -224,7 +226,7 @@ def _skin(spec: Region, globe: Globe, c: Contour, lash_line: Floats) -> Floats:
     crease = _crease(spec, c)
     v, y, z = _spokes(c, crease, lash_line)
     # Lids move their own skin, and move that of the brow and the cheek less the farther away it is.
-    y_rest, z_rest = _at_rest(spec.model_copy(update={"blink": 0.0}), len(c.angle))
+    y_rest, z_rest = _at_rest(spec.with_lids(), len(c.angle))
     y, z = y + _HELD * (y_rest - y), z + _HELD * (z_rest - z)
     depth = skin_depth(spec, globe, *(np.concatenate([lash_line[None, :, k], a]) for k, a in ((1, y), (2, z))))
     start, x = lash_line[:, 0] - depth[0], depth[1:]
@@ -316,13 +318,15 @@ def _fold(spec: Region, c: Contour, v: Floats, crease: Floats, strength: Floats)
         off = w - place - 0.5 * np.cos(2 * c.angle + place) - 0.35 * np.cos(c.angle)
         lift = lift - depth * shut * strength * np.exp(-((off / 0.55) ** 2)) * (lids.fold_mm > 0)
     bags = np.where(c.upper < 0, 1.0, 0.0) * lids.bags_mm * np.exp(-(((v - 8.5) / 3.5) ** 2)) * np.abs(np.sin(c.angle))
+    roll = _ROLL_MM * spec.moved("squint") * np.exp(-(((v - 3.5) / 2.2) ** 2))
+    bags = bags + np.where(c.upper < 0, roll, 0.0) * np.abs(np.sin(c.angle))
     line = np.where(c.upper < 0, -0.22, 0.0) * np.exp(-(((v - crease) / 0.7) ** 2)) * np.abs(np.sin(c.angle))
     return lift + bags + line, drop
 
 
 def _epicanthus(spec: Region, c: Contour, v: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
     """Draw skin from the upper lid and the nose over the medial canthus, as a fold in front of the caruncle."""
-    reach = spec.fissure.epicanthus_mm * (1 - 0.5 * spec.blink)
+    reach = spec.fissure.epicanthus_mm * (1 - 0.5 * spec.moved("blink"))
     along = np.where(c.upper > 0, step(c.along, 0.55, 0.97), step(c.along, 0.86, 1.0))
     fold = along * step(v, 0.1, 1.5) * np.exp(-(np.maximum(v - 1.5, 0) ** 2) / 16.0)
     rise = along * step(v, 0.0, 1.2) * np.exp(-(np.maximum(v - 1.2, 0) ** 2) / 9.0)

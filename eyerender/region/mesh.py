@@ -96,6 +96,21 @@ class LidMargins(ArrayValue):
     upper_margin: Floats
     lower_margin: Floats
 
+    def opening_mm(self, globe: Globe, y_mm: float) -> float:
+        """Compute the arc between both edges on the sclera's sphere in the plane y = `y_mm` of the eye's frame.
+
+        Its centre is that of the circle in which the plane cuts the sphere, and its ends are in the directions of the
+        points where the edges, straight between their landmarks, pass the plane.
+        """
+        centre = globe.mirror * globe.centre
+        angles = []
+        for edge in (self.upper_margin, self.lower_margin):
+            along = edge if edge[0, 1] < edge[-1, 1] else edge[::-1]
+            x, z = (np.interp(y_mm, along[:, 1], along[:, k]) - centre[k] for k in (0, 2))
+            angles.append(np.arctan2(z, x))
+        radius = np.sqrt(max(globe.radius_mm**2 - (y_mm - centre[1]) ** 2, 0.0))
+        return float(radius * max(angles[0] - angles[1], 0.0))
+
 
 def lid_margins(spec: Region, globe: Globe) -> LidMargins:
     """Compute only the lids' inner edges, without the surrounding mesh."""
@@ -108,7 +123,7 @@ def region_mesh(spec: Region, globe: Globe) -> RegionMesh:
     s = sheet(spec, globe)
     tears = meniscus(spec, globe, s)
     lash = lashes(spec, globe, s)
-    hair, hair_tubes, hair_normals = _brow(spec.model_copy(update={"blink": 0.0}))
+    hair, hair_tubes, hair_normals = _brow(spec.with_lids())
     lash_tubes, lash_normals = lash.tubes()
     film, film_normals = _closed(tears), _closed(grid_normals(tears))
     vertices = _joined(s.fine, s.coarse, lash_tubes, hair_tubes, film)

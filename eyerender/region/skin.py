@@ -83,7 +83,7 @@ def _texels() -> Floats:
 @lru_cache(maxsize=4)
 def skin_map(spec: Region) -> Singles:
     """Compute the map (rows, columns, 4) of a subject; it does not depend on the blink."""
-    reference = spec.model_copy(update={"blink": _REFERENCE_BLINK})
+    reference = spec.with_lids(_REFERENCE_BLINK)
     rest = sheet(reference, Globe.sphere()).vertices
     rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))
     columns = np.arange(_COLUMNS) * (rest.shape[1] / _COLUMNS)

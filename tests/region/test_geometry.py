@@ -66,6 +66,9 @@ def instance(i):
     blink = float(rng.choice([0.0, rng.uniform(), 1.0], p=[0.5, 0.4, 0.1]))
     side = ("right", "left")[i % 2]
     spec = Region.drawn(i, spread=float(rng.uniform(0.3, 1.0)), blink=blink)
+    if i % 3 == 0:  # eyes that squint or are wide open
+        squint, wide = np.random.default_rng((0x9E1, i)).choice([0.0, 0.5, 1.0], 2)
+        spec = spec.model_copy(update={"squint": float(squint), "wide": float(wide)})
     eye, globe = posed(MODELS[i % 5], rng.uniform(-25, 25, 2), side)
     return spec, eye, globe, region_mesh(spec, globe)
 

@@ -97,7 +97,10 @@ def _lids(entry: ImageEntry) -> Iterator[tuple[str, float]]:
             yield f"{LABEL}opening of the lids (px)", math.dist(upper[middle], lower[middle])
     if margins:
         scene = parse_json(_mapping(entry.line.get("parameters")).get("scene_json") or "{}")
-        yield LIDS_SHUT, float(_mapping(_mapping(scene).get("region")).get("blink") or 0.0)
+        shut = _mapping(_mapping(scene).get("region")).get("blink")
+        if isinstance(shut, Mapping):
+            shut = shut.get(next((record.get("eye") for record in entry.records), None))
+        yield LIDS_SHUT, float(shut or 0.0)
 
 
 def _part(part: str, own: Mapping[str, Any], origin: tuple[int, int]) -> Iterator[tuple[str, float]]:

@@ -255,7 +255,11 @@ class Tab:
             self._elevation = Knob("Elevation, up", "°", 0.5, lambda _: self._turn(), digits=2)
         with _group("Eye"):
             self._pupil = Knob("Pupil", "mm", 0.1, lambda v: self._change("eye.pupil_diameter_mm", v), digits=2)
-            self._lid = Knob("Lid opening", "%", 1, lambda v: self._apply(lambda s: s.with_opening(v / 100)))
+            self._lids = {
+                "blink": Knob("Lid opening", "%", 1, lambda v: self._apply(lambda s: s.with_opening(v / 100))),
+                "squint": Knob("Squint", "%", 1, lambda v: self._change("region.squint", v / 100)),
+                "wide": Knob("Wide open", "%", 1, lambda v: self._change("region.wide", v / 100)),
+            }
         with _group("LED"):
             count = len(self._setup.scene.rig.lights)
             self._lamp = _choice("LED", _numbers(count), self._choose_light)
@@ -415,9 +419,11 @@ class Tab:
         self._azimuth.set(gaze.azimuth_deg, -40, 40)
         self._elevation.set(gaze.elevation_deg, -30, 30)
         self._pupil.set(scene.pupil_diameter_mm, 1.5, 8)
-        region = scene.spec.region
-        self._lid.enable(region is not None and region.head is None)
-        self._lid.set(100 * (1 - (region.blink if region is not None else 0)), 0, 100)
+        region = None if scene.spec.region is None else scene.spec.region.of_side(setup.eye)
+        for name, knob in self._lids.items():
+            share = 0.0 if region is None else region.moved(name)
+            knob.enable(region is not None and region.head is None)
+            knob.set(100 * (1 - share if name == "blink" else share), 0, 100)
         self._refresh_light()
         apex = apex_mm(self._frames, self._row)
         _set_place(self._camera_place, scene.rig.cameras[self._lens].nodal_point_mm, apex)

@@ -292,7 +292,7 @@ def lid_landmarks(scene: Scene, view: EyeInWindow) -> dict[str, list[list[float]
     """Compute the landmarks along the lids in px, without an image; None for a bare eye and for a head mesh."""
     if scene.spec.region is None or scene.spec.region.head is not None:
         return None
-    margins = lid_margins(scene.spec.region, globe_of(view.eye, view.M, view.t - view.apex_mm))
+    margins = lid_margins(scene.spec.region.of_side(view.eye.side), globe_of(view.eye, view.M, view.t - view.apex_mm))
     camera = past_lenses(scene.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
     return lid_margins_px(margins, camera, view.apex_mm)
 

@@ -134,7 +134,7 @@ class RegionScene:
         """Return the cache key of a scene: the subject, the side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
         worn = tuple((b.part, len(b.vertices), b.albedo, hash(b.faces.tobytes())) for b in globe.frames)
-        return spec.model_copy(update={"blink": 0.0}), globe.mirrored, files, worn
+        return spec.with_lids(), globe.mirrored, files, worn
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
         """Pose lids and lashes, including a blink; the mesh of the pose may already be computed."""
@@ -150,7 +150,7 @@ class RegionScene:
     def at_rest(self, globe: Globe) -> RegionMesh:
         """Compute the mesh of the subject with open lids around a globe; the scene keeps its pose."""
         assert self._shown is not None
-        return self._posed(self._shown[0].model_copy(update={"blink": 0.0}), globe)
+        return self._posed(self._shown[0].with_lids(), globe)
 
     def _set(self, name: str, array: str, values: mi.Float | mi.UInt32) -> None:
         """Set an array of a mesh."""
@@ -173,7 +173,7 @@ class RegionScene:
 
     @staticmethod
     def _look(spec: Region) -> NDArray[np.float16]:
-        return kept(skin_texels, spec.model_copy(update={"blink": 0.0}))
+        return kept(skin_texels, spec.with_lids())
 
     def _inner(self) -> Bools | None:
         """Mark triangles of the sheet of skin away from its ends; None if it may not be a single surface."""
