@@ -95,7 +95,8 @@ class Maker:
                     yield found
 
         labels = self.plan.spec.labels
-        images = begin_each(frames(), self.renderer, highlights=labels.highlights, geometry=labels.geometry or ())
+        wanted = {"highlights": labels.highlights, "annotated": labels.as_annotated, "geometry": labels.geometry or ()}
+        images = begin_each(frames(), self.renderer, **wanted)
         for first in images:
             while not waiting[0].frames:
                 yield self._rest(waiting.popleft(), ())
@@ -174,6 +175,7 @@ _PICTURES: dict[str, Callable[[EyeImage], NDArray[Any]]] = {
     "images": attrgetter("counts"),
     "masks": attrgetter("parts"),
     "amodal_masks": attrgetter("rendered.labels.amodal"),
+    "as_annotated": attrgetter("rendered.labels.annotated"),
     "noiseless": noiseless,
     "highlights": lambda image: np.asarray(image.rendered.highlights, np.uint8),
     "lens_reflections": attrgetter("lens_reflections"),

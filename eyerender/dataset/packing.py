@@ -35,7 +35,7 @@ from .selection import scrambled
 
 ENDINGS = {
     "images": "", "masks": ".mask", "amodal_masks": ".amodal", "noiseless": ".noiseless", "highlights": ".highlights",
-    "lens_reflections": ".lens_reflections",
+    "lens_reflections": ".lens_reflections", "as_annotated": ".as_annotated",
     "depth": ".depth", "normals": ".normals", "iris_coordinates": ".iris_coordinates", "instances": ".instances",
 }  # fmt: skip
 SHARD = "shard"  # folder of the lines of a partial shard

@@ -40,6 +40,10 @@ class LabelsSpec(Spec):
         default=30, description="boundary points of the pupil in the record"
     )
     amodal_masks: bool = Field(default=False, description="also write masks of the eye without anything in front of it")
+    as_annotated: bool = Field(
+        default=False,
+        description="also write masks as people draw them: lids cut the eye, lashes and glints do not",
+    )
     noiseless: bool = Field(
         default=False, description="also write each image without sensor noise, from the same rendering"
     )
@@ -70,7 +74,7 @@ class LabelsSpec(Spec):
     @property
     def pictures(self) -> tuple[str, ...]:
         """Kinds of images that every sample has; each kind has its own folder."""
-        more = ("amodal_masks", "noiseless", "highlights", "lens_reflections")
+        more = ("amodal_masks", "as_annotated", "noiseless", "highlights", "lens_reflections")
         return (
             "images",
             "masks",

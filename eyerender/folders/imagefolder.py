@@ -68,11 +68,12 @@ KINDS = {
     "normals": "normals_file_name",
     "iris_coordinates": "iris_coordinates_file_name",
     "instances": "instance_mask_file_name",
+    "as_annotated": "annotated_mask_file_name",
 }
 # Keys of a line that name arrays of real numbers, with the number of channels of each (0: none).
 ARRAY_KEYS = {"depth_file_name": 0, "normals_file_name": 3, "iris_coordinates_file_name": 2}
 # Keys of a line that name files of the folder.
-FILE_KEYS = (*KINDS.values(), "annotated_mask_file_name")
+FILE_KEYS = tuple(KINDS.values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,6 +191,10 @@ class ImageEntry:
             InputError: as for `image`; the file does not have 8 bits.
         """
         return self.pixels("mask_file_name")
+
+    def annotated_mask(self) -> Bytes | None:
+        """Read the mask as people draw it, in which lashes and glints hide nothing; like `mask`."""
+        return self.pixels("annotated_mask_file_name")
 
     def amodal_mask(self) -> Bytes | None:
         """Read the mask of the eye without occluders; like `mask`."""

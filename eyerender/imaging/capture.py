@@ -151,7 +151,12 @@ class BegunImage:
 
 
 def begin_each(
-    many: Iterable[RenderableFrames], renderer: Renderer, *, highlights: bool = False, geometry: tuple[str, ...] = ()
+    many: Iterable[RenderableFrames],
+    renderer: Renderer,
+    *,
+    highlights: bool = False,
+    annotated: bool = False,
+    geometry: tuple[str, ...] = (),
 ) -> Iterator[BegunImage]:
     """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
@@ -162,12 +167,13 @@ def begin_each(
         many: the frames, one scene after the other.
         renderer: what traces them.
         highlights: whether to find the highlights of wet and oily surfaces.
+        annotated: whether to compute the masks that people would draw.
         geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
 
     Raises:
         InputError: a scene's windows cannot be rendered.
     """
-    steps = _steps(many, {"highlights": highlights, "geometry": geometry})
+    steps = _steps(many, {"highlights": highlights, "annotated": annotated, "geometry": geometry})
     step = next(steps, None)
     while step is not None:
         failed: Exception | None = None

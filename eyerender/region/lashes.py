@@ -164,10 +164,10 @@ def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
-    if fold_back > 0.2:
-        # In the corners of closed lids the nearest skin is a poor guide. A lash that still crosses it is collapsed to
-        # its root.
-        corner = np.flatnonzero(np.abs(np.sin(p.angle)) < 0.75)
+    if fold_back > 0.2 or spec.moved("wide") > 0:
+        # In the corners of closed lids, and below the fold of wide ones, the nearest skin is a poor guide. A lash that
+        # still crosses it is collapsed to its root.
+        corner = np.flatnonzero((np.abs(np.sin(p.angle)) < 0.75) | (fold_back <= 0.2))
         stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
         points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
     thick = spec.lashes.diameter_mm * (1 + 0.7 * spec.lashes.mascara)
@@ -183,7 +183,8 @@ def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
     n = sheet.vertices.shape[1]
     across = np.rint(angle / (2 * np.pi) * n).astype(int)[:, None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)
     columns = np.concatenate([across, n - across], axis=1) % n
-    rows = sheet.vertices[CONJUNCTIVA + 2 : CONJUNCTIVA + MARGIN + LID - 3]
+    last = CONJUNCTIVA + MARGIN + LID + (-3 if sheet.contour.openness < 1 else 3)  # of an open lid, with its fold
+    rows = sheet.vertices[CONJUNCTIVA + 2 : last]
     left, right = np.moveaxis(rows[:, columns], 0, 1), np.moveaxis(rows[:, (columns + 1) % n], 0, 1)
     a, b, c, d = left[:, :-1], right[:, :-1], left[:, 1:], right[:, 1:]
     corner = np.concatenate([a, a], axis=1)

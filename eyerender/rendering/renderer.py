@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from .integrator.film import coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import BoundFrame, HostData
 from .output.geometry import Hits, window_hits
-from .output.labels import PartLabels, highlights, part_labels
+from .output.labels import PartLabels, annotated_parts, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
 from .records.job import RenderJob
 from .records.recording import uncollected
@@ -156,10 +157,14 @@ def _marks(
     """Start computing labels, margins of the lids (px), highlights and geometry, as far as the job wants them."""
     hits = window_hits(bound, job, surroundings) if job.geometry else lambda: None
     labels = part_labels(bound, job.window) if job.labels and not job.geometry else lambda: None
+    drawn = annotated_parts(bound, job.window) if job.annotated and job.region is not None else None
 
     def read() -> tuple[PartLabels | None, Any, Bools | None, Hits | None]:
         found = hits()
         bright = highlights(bound, job.window) if job.highlights else None
-        return labels() if found is None else found.labels, bound.host.lid_margins_px, bright, found
+        parts = labels() if found is None else found.labels
+        if job.annotated and parts is not None:
+            parts = replace(parts, annotated=parts.part if drawn is None else drawn())
+        return parts, bound.host.lid_margins_px, bright, found
 
     return read

@@ -25,6 +25,7 @@ def folder(tmp_path_factory):
     """Three frames of one subject of the shipped spec, few rays, its lids more and more shut."""
     data = DatasetSpec.load(find_dataset("dataset_region")).to_mapping()
     data |= {"count": 3, "subjects": 1, "splits": {"train": 1.0}}
+    data["labels"] = {**data["labels"], "as_annotated": True}
     data["scene"]["image"]["spp"] = 1
     data["scene"]["region"]["blink"] = {"draw": "sequence", "values": [0.0, 0.45, 0.75]}
     return make_or_skip(tmp_path_factory.mktemp("region") / "out", Plan.of(DatasetSpec.from_mapping(data)))
@@ -71,7 +72,9 @@ def test_its_lines_have_the_keys_of_bare_eyes(tiny, folder):
 
     bare, lidded = (json.loads((place / "metadata.jsonl").read_text().splitlines()[0]) for place in (tiny, folder))
     own = {".labels.lid_margins_px.upper", ".labels.lid_margins_px.lower"}
-    assert below(lidded["labels"], ".labels") == below(bare["labels"], ".labels") - {".labels.lid_margins_px"} | own
+    own |= {".labels.lid_opening.mm", ".labels.lid_opening.share"}
+    null = {".labels.lid_margins_px", ".labels.lid_opening"}
+    assert below(lidded["labels"], ".labels") == below(bare["labels"], ".labels") - null | own
     assert below(lidded["records"]) == below(bare["records"])
 
 
@@ -84,6 +87,28 @@ def test_webdataset_has_its_amodal_masks(folder, tmp_path):
     for sample in samples:
         name = json.loads(sample["json"])["amodal_mask_file_name"]
         assert sample["amodal.png"] == (folder / name).read_bytes()
+
+
+def test_exports_take_masks_as_people_draw_them(folder, tmp_path):
+    export(folder, "openeds", tmp_path / "out")
+    entries = ImageFolder.load(folder).entries
+    for k, entry in enumerate(entries):
+        drawn, mask, whole = entry.annotated_mask(), entry.mask(), entry.amodal_mask()
+        assert np.all((drawn == mask) | (mask == 0))
+        assert np.all((drawn == whole) | (drawn == 0))
+        assert np.array_equal(np.load(tmp_path / "out" / "train" / "labels" / f"{k:06d}.npy"), drawn)
+    assert any(np.any(entry.annotated_mask() != entry.mask()) for entry in entries)
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    path = copy / entries[0].line["annotated_mask_file_name"]
+    write_png(path, np.zeros_like(read_image(path)[0]))
+    assert any("annotated mask lacks" in problem for problem in validate(copy)["problems"])
+
+
+def test_the_opening_falls_with_the_blink(folder):
+    entries = sorted(ImageFolder.load(folder).entries, key=lambda e: e.line["sample"])
+    shares = [entry.line["labels"]["lid_opening"]["share"] for entry in entries]
+    assert shares[0] == 1.0
+    np.testing.assert_allclose(shares[1:], [0.55, 0.25], atol=0.04)  # shut lids meet above the lower lid's place
 
 
 def test_lids_hide_what_the_labels_say(folder):

@@ -85,7 +85,7 @@ def write(items: Items, out: Path) -> None:
 def _values(item: Item) -> tuple[str, dict[str, Any]]:
     """Return the split of an image, and its values of each array of an archive."""
     fits = {part: fit_of(item, part) for part in ("pupil", "iris")}
-    pictures = {"Images": item.encoded, "Masks": item.mask, "Masks_noSkin": item.amodal}
+    pictures = {"Images": item.encoded, "Masks": item.drawn_mask, "Masks_noSkin": item.amodal}
     places = {**{f"Fits/{part}": fit for part, fit in fits.items()}, "pupil_loc": fits["pupil"][:2]}
     return item.split, {**pictures, **places, "Info": item.entry.name.encode()}
 

@@ -129,6 +129,12 @@ class Item:
         return mask is not None and bool(mask[round(y), round(x)] > PUPIL)
 
     @cached_property
+    def drawn_mask(self) -> Bytes:
+        """Mask as people draw it, where lashes hide nothing; `mask` if the dataset has no such masks."""
+        drawn = self.entry.annotated_mask()
+        return self.mask if drawn is None else np.where(drawn > PUPIL, BACKGROUND, drawn)
+
+    @cached_property
     def amodal(self) -> Bytes:
         """Mask of the eye without occluders: from its file, or the mask with both ellipses filled in."""
         whole = self.entry.amodal_mask()

@@ -36,4 +36,4 @@ def write(items: Items, out: Path) -> None:
 
 def _files(item: Item) -> tuple[str, bytes, Bytes, str, int]:
     """Return the split of an image, its file, its mask, its name in the dataset and its subject."""
-    return item.split, png_bytes(item.encoded), item.mask, item.entry.name, item.line["subject"]
+    return item.split, png_bytes(item.encoded), item.drawn_mask, item.entry.name, item.line["subject"]

@@ -1,7 +1,7 @@
 """Parquet: data/SPLIT-00000-of-00001.parquet with one row per image, as the Hugging Face Hub stores datasets.
 
-The columns `image` and `mask` (and `amodal_mask`, `noiseless`, `highlight_mask`, `lens_reflection_mask` where the
-dataset has them) hold PNG files. The labels have the columns of the layout csv, in pixels of the image. `line_json` is
+The columns `image` and `mask` (and `amodal_mask`, `annotated_mask`, `noiseless`, `highlight_mask`,
+`lens_reflection_mask` where the dataset has them) hold PNG files. The labels have the columns of the layout csv, in pixels of the image. `line_json` is
 the whole line of metadata as JSON text. Load the folder with `datasets.load_dataset("OUT")`, or upload it unchanged:
 the head of README.md names columns and splits for the Hub's viewer.
 """
@@ -28,6 +28,7 @@ _PICTURES = {
     "image": "file_name",
     "mask": "mask_file_name",
     "amodal_mask": "amodal_mask_file_name",
+    "annotated_mask": "annotated_mask_file_name",
     "noiseless": "noiseless_file_name",
     "highlight_mask": "highlight_mask_file_name",
     "lens_reflection_mask": "lens_reflection_mask_file_name",

@@ -95,7 +95,7 @@ def _frame(item: Item) -> _Frame:
         camera=record["camera"],
         split=item.split,
         picture=item.encoded,
-        mask=item.mask,
+        mask=item.drawn_mask,
         rows=rows_of(item),
     )
 

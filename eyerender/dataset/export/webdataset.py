@@ -1,7 +1,7 @@
 """WebDataset: tar files of at most 1000 images per split; NAME.png, NAME.mask.png and NAME.json form a sample.
 
-Where the dataset has them, there are NAME.amodal.png, NAME.highlights.png, NAME.lens_reflections.png,
-NAME.noiseless.png, NAME.instances.png, NAME.depth.npz, NAME.normals.npz and NAME.iris_coordinates.npz, too.
+Where the dataset has them, there are NAME.amodal.png, NAME.as_annotated.png, NAME.highlights.png,
+NAME.lens_reflections.png, NAME.noiseless.png, NAME.instances.png, NAME.depth.npz, NAME.normals.npz and NAME.iris_coordinates.npz, too.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .item import Item, Items
 SAMPLES = 1000
 # The order of an image's files.
 _KINDS = (
-    *("images", "masks", "amodal_masks", "highlights", "lens_reflections", "instances"),
+    *("images", "masks", "amodal_masks", "as_annotated", "highlights", "lens_reflections", "instances"),
     *("depth", "normals", "iris_coordinates", "noiseless"),
 )
 

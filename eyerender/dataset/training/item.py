@@ -28,6 +28,7 @@ PICTURES = {
     "noiseless": "noiseless",
     "mask": "masks",
     "amodal_mask": "amodal_masks",
+    "annotated_mask": "as_annotated",
     "highlight_mask": "highlights",
     "lens_reflection_mask": "lens_reflections",
     "instance_mask": "instances",

@@ -114,14 +114,17 @@ def _rays(entry: ImageEntry) -> Floats:
 def _masks(entry: ImageEntry, mask: Mask, whole: Mask | None, limbus_px: Floats | None) -> Iterator[str]:
     """Return masks of the visible parts and, if available, of the whole parts."""
     w, h = entry.window[2:]
-    for name, picture in (("mask", mask), ("amodal mask", whole)):
+    drawn = entry.annotated_mask()
+    for name, picture in (("mask", mask), ("amodal mask", whole), ("annotated mask", drawn)):
         if picture is None:
             continue
         if picture.shape != (h, w):
             yield f"its {name} is {_size(picture)} px"
             return
-        if int(picture.max()) > (SPECTACLES if picture is mask else PUPIL):
+        if int(picture.max()) > (PUPIL if picture is whole else SPECTACLES):
             yield f"its {name} holds the value {int(picture.max())}"
+    if drawn is not None and np.any((mask != SKIN) & (drawn != mask)):
+        yield "its annotated mask lacks a part that its mask shows there"
     yield from _visible(entry.line, mask, entry.window)
     yield from _outlines(entry.line, mask, whole, limbus_px, entry.window)
 

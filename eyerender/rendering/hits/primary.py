@@ -16,6 +16,8 @@ from ..scene.background import HALF_MM
 from .eyeshape import EyeShape
 from .interaction import SurfaceInteraction
 
+_PAST_MM = 2e-3  # step past the surface of a hair: more than rounding from a camera, less than a hair is thick
+
 
 @dataclass(kw_only=True)
 class TriangleHit:
@@ -71,6 +73,24 @@ def hit_before(
         return TriangleHit.on_plane(frame.backdrop_x, o, d, nearest)
     ray = segment(o, d, nearest)
     return TriangleHit.of(frame.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active))
+
+
+@syntax
+def hit_past_hairs(
+    frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float
+) -> tuple[mi.Bool, mi.UInt32]:
+    """Intersect rays with a region as if it had no lashes and no brow, up to a distance: whether any, which triangle."""
+    first = hit_before(frame, o, d, nearest, mi.Bool(True))
+    start, t, face = mi.Float(0), mi.Float(first.t), frame.region.face(first)
+    hair = first.is_valid() & frame.region.on_hair(face)
+    while dr.hint(hair, label="hairs", exclude=[frame, o, d, nearest]):
+        start += t + _PAST_MM
+        ray = segment(o + start * d, d, nearest - start)
+        after = frame.scene.ray_intersect_preliminary(ray, coherent=False, active=hair)
+        t = dr.select(after.is_valid(), after.t, dr.inf)
+        face = frame.region.face(after)
+        hair = after.is_valid() & frame.region.on_hair(face)
+    return t < dr.inf, face
 
 
 def behind(eye: SurfaceInteraction, hit: TriangleHit, active: mi.Bool) -> SurfaceInteraction:

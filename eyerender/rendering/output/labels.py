@@ -15,7 +15,7 @@ from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA, SPECTACLES
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import on_water
-from ..hits.primary import TriangleHit, first_hit, hidden, hit_before
+from ..hits.primary import first_hit, hidden, hit_before, hit_past_hairs
 from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
 from ..records.frame import DeviceFrame
@@ -36,16 +36,20 @@ class PartLabels(ArrayValue):
         part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view and obstacles, 5
             frame of spectacles.
         amodal: the same for the eye alone, without occluders.
+        annotated: as people draw masks, behind lids but not behind lashes and brow; None if it was not requested.
     """
 
     part: Bytes
     amodal: Bytes
+    annotated: Bytes | None = None
 
     def behind(self, covered: Bools) -> PartLabels:
         """Return the labels with a frame around the view over the `covered` pixels (height, width)."""
-        part = self.part.copy()
-        np.copyto(part, FRAME, where=covered)
-        return replace(self, part=sealed(part))
+        part, drawn = (None if seen is None else seen.copy() for seen in (self.part, self.annotated))
+        for seen in (part, drawn):
+            if seen is not None:
+                np.copyto(seen, FRAME, where=covered)
+        return PartLabels(sealed(part), self.amodal, None if drawn is None else sealed(drawn))
 
     def visible_fraction(self, part: int, whole: float | None = None) -> float:
         """Compute the visible share of a part, of `whole` pixels or its amodal ones in the window; NaN if of none."""
@@ -82,6 +86,25 @@ def _parts(frame: DeviceFrame, pixels: Pixels, count: int) -> tuple[mi.UInt8, mi
     return part, amodal
 
 
+def annotated_parts(bound: BoundFrame, window: Window) -> Callable[[], Bytes]:
+    """Start computing a mask as people draw it: lids cut the eye, lashes and brow do not; for a region."""
+    _, _, width, height = window
+    found = _annotated(bound.frame.bare(), Pixels.of(window), width * height)
+    return lambda: frozen(found.numpy().reshape(height, width), np.uint8)
+
+
+@recorded
+def _annotated(frame: DeviceFrame, pixels: Pixels, count: int) -> mi.UInt8:
+    """Return the parts at the pixels' centres behind everything but hairs."""
+    u, v = pixels.at(dr.arange(mi.UInt32, count))
+    o, d, _ = camera_ray(frame, mi.Float(u), mi.Float(v))
+    eye = EyeShape(frame=frame).ray_intersect(o, d)
+    met, face = hit_past_hairs(frame, o, d, eye.distance)
+    part = dr.select(met, _cover_at(frame, face), part_of(eye))
+    dr.eval(part)
+    return part
+
+
 def closed_hit(frame: DeviceFrame, u: mi.Float, v: mi.Float, nearest: mi.Float, hit: TriangleHit) -> TriangleHit:
     """Replace misses of the rays of pixels (u, v) that slipped between two triangles by the hits beside them."""
     beside = _hit_beside(frame, u, v, nearest, ~hit.is_valid())
@@ -112,12 +135,16 @@ def _hit_beside(frame: DeviceFrame, u: mi.Float, v: mi.Float, nearest: mi.Float,
 
 def cover_of(frame: DeviceFrame, hit: TriangleHit) -> mi.UInt8:
     """Return the part at hits before the eye: spectacles, obstacles (as a frame of the view) or background."""
-    nothing = mi.UInt8(BACKGROUND)
     if frame.region is None:
         obstacle = frame.structure.obstacles & (hit.prim_index >= PLANE_FACES)
-        return dr.select(obstacle, mi.UInt8(FRAME), nothing)
-    face = frame.region.face(hit)
-    part = dr.select(frame.region.on_spectacles(face), mi.UInt8(SPECTACLES), nothing)
+        return dr.select(obstacle, mi.UInt8(FRAME), mi.UInt8(BACKGROUND))
+    return _cover_at(frame, frame.region.face(hit))
+
+
+def _cover_at(frame: DeviceFrame, face: mi.UInt32) -> mi.UInt8:
+    """Return the same at triangles of a region."""
+    assert frame.region is not None
+    part = dr.select(frame.region.on_spectacles(face), mi.UInt8(SPECTACLES), mi.UInt8(BACKGROUND))
     return dr.select(frame.region.on_obstacles(face), mi.UInt8(FRAME), part)
 
 

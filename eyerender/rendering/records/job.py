@@ -73,6 +73,7 @@ class RenderJob(ArrayValue):
         seed: seed of samples and noise.
         labels: whether to compute raster labels.
         highlights: whether to find the highlights of wet and oily surfaces.
+        annotated: whether to compute the mask that people would draw.
         geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
         flip: whether to turn the window left to right in the end; camera and window are those before.
         purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
@@ -107,6 +108,7 @@ class RenderJob(ArrayValue):
     mesh_edge_mm: float | None = None
     interreflection: bool = True
     highlights: bool = False
+    annotated: bool = False
     geometry: tuple[str, ...] = ()
     flip: bool = False
     obstacles: tuple[Body, ...] = ()

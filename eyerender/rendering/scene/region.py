@@ -247,6 +247,7 @@ class SkinGeometry:
             coordinate of the map.
         received: four numbers per vertex: light from other surfaces, as in `radiosityfield.RadiosityField`.
         sheet: number of triangles of the sheet, which come first.
+        hairs_end: number of the first triangle behind the hairs, which follow the sheet.
         film: number of the first triangle of the menisci.
         mirror: -1 for a left eye, else 1.
         thin: coordinate v of the map at which the conjunctiva has its full thickness; 0 without a map.
@@ -261,6 +262,7 @@ class SkinGeometry:
     vertices: mi.Float
     received: mi.Float
     sheet: mi.UInt32
+    hairs_end: mi.UInt32
     film: mi.UInt32
     mirror: mi.Float
     thin: mi.Float
@@ -290,11 +292,11 @@ class SkinGeometry:
         faces = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         faces[:, :3] = layout.faces
         faces[: layout.face_ends[0], 3] = False if inner is None else ~inner
-        sheet, film = (dr.opaque(mi.UInt32, int(layout.face_ends[k])) for k in (0, -2))
+        sheet, hairs_end, film = (dr.opaque(mi.UInt32, int(layout.face_ends[k])) for k in (0, HAIRS, -2))
         return cls(
             map=look, water=water, is_sheet=inner is not None, faces=mi.UInt32(aligned_copy(faces.ravel())),
-            vertices=mi.Float(0), received=mi.Float(0), sheet=sheet, film=film, mirror=dr.opaque(mi.Float, mirror),
-            thin=dr.opaque(mi.Float, thin),
+            vertices=mi.Float(0), received=mi.Float(0), sheet=sheet, hairs_end=hairs_end, film=film,
+            mirror=dr.opaque(mi.Float, mirror), thin=dr.opaque(mi.Float, thin),
         )  # fmt: skip
 
     def corners(self, face: mi.UInt32) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f, mi.Bool]:
@@ -360,6 +362,10 @@ class SkinGeometry:
     def on_sheet(self, face: mi.UInt32) -> mi.Bool:
         """Return whether a triangle belongs to the sheet of skin rather than to something in front of it."""
         return face < self.sheet
+
+    def on_hair(self, face: mi.UInt32) -> mi.Bool:
+        """Return whether a triangle belongs to a lash or to the brow."""
+        return (face >= self.sheet) & (face < self.hairs_end)
 
     def on_spectacles(self, face: mi.UInt32) -> mi.Bool:
         """Return whether a triangle belongs to the frame of spectacles."""

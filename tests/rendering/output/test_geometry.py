@@ -229,6 +229,6 @@ def test_labels_of_a_dataset_name_the_kinds_of_geometry():
     labels = er.dataset.LabelsSpec(geometry=("instances", "depth"))
     assert labels.pictures == ("images", "masks", "depth", "instances")
     assert er.dataset.LabelsSpec().to_mapping() == {
-        "boundary_points": 30, "amodal_masks": False, "noiseless": False, "highlights": False,
+        "boundary_points": 30, "amodal_masks": False, "as_annotated": False, "noiseless": False, "highlights": False,
         "lens_reflections": False, "half_precision": False
     }  # fmt: skip
