@@ -30,7 +30,7 @@ _LABELS = """\
 
 _MORE = {
     "amodal_masks": "\n- `amodal_mask_file_name`: the same without anything in front of the eye.",
-    "as_annotated": "\n- `annotated_mask_file_name`: the same as people draw it: lids cut the eye, lashes and glints do not.",
+    "as_annotated": "\n- `annotated_mask_file_name`: the mask as people draw it: lids cut the eye, lashes do not.",
     "noiseless": "\n- `noiseless_file_name`: the same rendering exposed without sensor noise.",
     "highlights": "\n- `highlight_mask_file_name`: 1 where wet and oily surfaces mirror a lamp; these are no glints.",
     "lens_reflections": "\n- `lens_reflection_mask_file_name`: 1 where a spectacle lens mirrors more light than comes "

@@ -260,9 +260,7 @@ _NOT_DRAWN = ("head", "map", "mascara", "squint", "wide")
 
 def _draw(kind: type[Spec], key: tuple[int, ...], spread: float) -> dict[str, object]:
     out: dict[str, object] = {}
-    fields = [
-        (name, field) for name, field in sorted(kind.model_fields.items()) if name not in _NOT_DRAWN
-    ]
+    fields = [(name, field) for name, field in sorted(kind.model_fields.items()) if name not in _NOT_DRAWN]
     for i, (name, field) in enumerate(fields):
         if isinstance(field.annotation, type) and issubclass(field.annotation, Spec):
             out[name] = _draw(field.annotation, (*key, i), spread)

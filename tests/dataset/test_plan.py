@@ -24,6 +24,7 @@ from tests.support.dataset_specs import mapping, plan, write
 from tests.support.paths import load
 
 PEOPLE = ("people_eyelink", "people_iris_camera", "people_nvgaze", "people_openeds", "people_pupil_core")
+HEADSETS = ("people_any_headset", "people_two_cameras")
 
 
 def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
@@ -33,7 +34,7 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
         "dataset_glasses",
         "dataset_quick",
         "dataset_region",
-        *PEOPLE,
+        *sorted((*PEOPLE, *HEADSETS)),
     ]
     for name, path in shipped_datasets().items():
         spec = DatasetSpec.load(path)

@@ -84,8 +84,8 @@ def test_all_are_covered():
     assert NAMES == [
         "bench_world", "blignaut2014", "dataset_binocular", "dataset_glasses", "dataset_quick", "dataset_region",
         "desktop_tracker", "eyelink_desktop", "guestrin2006", "head_mounted", "headset", "headset_binocular",
-        "people_eyelink",
-        "people_iris_camera", "people_nvgaze", "people_openeds", "people_pupil_core", "quickstart", "stress", "webcam",
+        "people_any_headset", "people_eyelink", "people_iris_camera", "people_nvgaze", "people_openeds",
+        "people_pupil_core", "people_two_cameras", "quickstart", "stress", "webcam",
     ]  # fmt: skip
 
 
@@ -101,7 +101,7 @@ def test_a_window_at_grazing_incidence_leaves_the_picture_finite():
     data["scene"]["ambient"] = {"map": {"place": "office", "place_seed": 51054, "azimuth_deg": -98.3}}
     plan = Plan.of(DatasetSpec.from_mapping(data))
     (sample,) = Maker(plan, frames_of(plan), threads=1).make_all([200])
-    assert len(sample.images) == 1
+    assert len(sample.images) == 2
 
 
 def test_shipped_datasets_state_their_licence():

@@ -114,6 +114,8 @@ MORE = (
     "people_pupil_core",
     "people_eyelink",
     "people_iris_camera",
+    "people_two_cameras",
+    "people_any_headset",
     "dataset_region",
     "dataset_binocular",
     "dataset_glasses",

@@ -2,6 +2,10 @@
 
 Archive: Images, Masks, Masks_noSkin (n, h, w); pupil_loc (n, 2); Fits/pupil, Fits/iris (n, 5) = x, y, a, b, angle
 (rad); Info; -1 where there is none. Kothari et al. (2021), "EllSeg: An Ellipse Segmentation Framework".
+
+Masks are as people draw them (lids cut the eye, lashes do not) where the dataset has such masks; else lashes are
+background. In the collections that were labelled by people, ellipses are fitted to what is visible; these come from ray
+optics, also where nothing of the pupil shows.
 """
 
 from __future__ import annotations

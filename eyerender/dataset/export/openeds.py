@@ -1,6 +1,10 @@
 """OpenEDS (semantic segmentation, 2019): SPLIT/images/000000.png (8 bits) and SPLIT/labels/000000.npy.
 
 Labels are uint8: 0 background, 1 sclera, 2 iris, 3 pupil. Garbin et al. (2019), "OpenEDS: Open Eye Dataset".
+
+Where the dataset has masks as people draw them, lids cut the eye and lashes do not, as there; else lashes are
+background. Labels of people are ellipses and polygons through some points; these are exact outlines: pupils are no
+ellipses, and the caruncle is background.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Parquet: data/SPLIT-00000-of-00001.parquet with one row per image, as the Hugging Face Hub stores datasets.
 
 The columns `image` and `mask` (and `amodal_mask`, `annotated_mask`, `noiseless`, `highlight_mask`,
-`lens_reflection_mask` where the dataset has them) hold PNG files. The labels have the columns of the layout csv, in pixels of the image. `line_json` is
-the whole line of metadata as JSON text. Load the folder with `datasets.load_dataset("OUT")`, or upload it unchanged:
-the head of README.md names columns and splits for the Hub's viewer.
+`lens_reflection_mask` where the dataset has them) hold PNG files. The labels have the columns of the layout csv, in
+pixels of the image. `line_json` is the whole line of metadata as JSON text. Load the folder with
+`datasets.load_dataset("OUT")`, or upload it unchanged: the head of README.md names columns and splits for the Hub's
+viewer.
 """
 
 from __future__ import annotations

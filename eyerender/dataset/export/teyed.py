@@ -6,10 +6,13 @@
     NAME.mp4gaze_vec.txt                          FRAME;X;Y;Z;       optic axis, unit vector, camera
     NAME.mp4eye_ball.txt                          FRAME;RADIUS;X;Y;Z;                           px, px, px, mm
     NAME.mp4validity_pupil.txt, iris, lid         FRAME;VALIDITY;
-    NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where visible
+    NAME.mp4pupil_seg_2D.mp4, iris_seg_2D.mp4     white where the lids leave it visible
 
 Frames count from 1; -1 marks a missing value. Fuhl, Kasneci and Kasneci (2021), "TEyeD". The videos are lossless (FFV1,
 8 bits); if a frame's width or height is odd, its last column or row is repeated.
+
+Lashes cut the areas only where the dataset has no masks as people draw them. Landmarks of people are off by some
+pixels; these are exact, with an inaccuracy of 0.
 """
 
 from __future__ import annotations

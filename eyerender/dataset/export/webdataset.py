@@ -1,7 +1,8 @@
 """WebDataset: tar files of at most 1000 images per split; NAME.png, NAME.mask.png and NAME.json form a sample.
 
 Where the dataset has them, there are NAME.amodal.png, NAME.as_annotated.png, NAME.highlights.png,
-NAME.lens_reflections.png, NAME.noiseless.png, NAME.instances.png, NAME.depth.npz, NAME.normals.npz and NAME.iris_coordinates.npz, too.
+NAME.lens_reflections.png, NAME.noiseless.png, NAME.instances.png, NAME.depth.npz, NAME.normals.npz and
+NAME.iris_coordinates.npz, too.
 """
 
 from __future__ import annotations

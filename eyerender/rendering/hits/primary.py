@@ -16,7 +16,7 @@ from ..scene.background import HALF_MM
 from .eyeshape import EyeShape
 from .interaction import SurfaceInteraction
 
-_PAST_MM = 2e-3  # step past the surface of a hair: more than rounding from a camera, less than a hair is thick
+_PAST = 1e-4, 1e-6  # step past the surface of a hair: mm, and share of the distance (rounding)
 
 
 @dataclass(kw_only=True)
@@ -76,15 +76,13 @@ def hit_before(
 
 
 @syntax
-def hit_past_hairs(
-    frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float
-) -> tuple[mi.Bool, mi.UInt32]:
-    """Intersect rays with a region as if it had no lashes and no brow, up to a distance: whether any, which triangle."""
+def hit_past_hairs(frame: DeviceFrame, o: mi.Vector3f, d: mi.Vector3f, nearest: mi.Float) -> tuple[mi.Bool, mi.UInt32]:
+    """Intersect rays with a region without its hairs, up to a distance: whether any triangle is hit, and which."""
     first = hit_before(frame, o, d, nearest, mi.Bool(True))
     start, t, face = mi.Float(0), mi.Float(first.t), frame.region.face(first)
     hair = first.is_valid() & frame.region.on_hair(face)
     while dr.hint(hair, label="hairs", exclude=[frame, o, d, nearest]):
-        start += t + _PAST_MM
+        start += t + _PAST[0] + _PAST[1] * t
         ray = segment(o + start * d, d, nearest - start)
         after = frame.scene.ray_intersect_preliminary(ray, coherent=False, active=hair)
         t = dr.select(after.is_valid(), after.t, dr.inf)
