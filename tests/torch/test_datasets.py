@@ -30,6 +30,7 @@ from eyerender.torch import PARTS, Augment, FolderDataset, StreamDataset, collat
 pytestmark = pytest.mark.render
 LACKING = (
     "amodal_mask",
+    "annotated_mask",
     "highlight_mask",
     "lens_reflection_mask",
     "instance_mask",

@@ -18,7 +18,7 @@ def labels(renderer, **changes):
     return renderer.render(job, spp=1).labels
 
 
-@pytest.mark.parametrize("blink", [0.45, 0.7])
+@pytest.mark.parametrize("blink", [0.6])
 def test_it_is_the_mask_of_a_lid_without_lashes(renderer, blink):
     """The same lids rendered without any hair; two rays along silhouettes may differ by the step past a hair."""
     region = Region(seed=5, blink=blink, lashes=Lashes(upper_length_mm=12.0))
