@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...base.arrays import ArrayValue, Bools, Bytes, frozen, sealed
+from ...base.arrays import ArrayValue, Bools, Bytes, frozen
 from ...rig.camera import Window
 from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA, SPECTACLES
 from ..hits.eyeshape import EyeShape
@@ -45,11 +45,8 @@ class PartLabels(ArrayValue):
 
     def behind(self, covered: Bools) -> PartLabels:
         """Return the labels with a frame around the view over the `covered` pixels (height, width)."""
-        part, drawn = (None if seen is None else seen.copy() for seen in (self.part, self.annotated))
-        for seen in (part, drawn):
-            if seen is not None:
-                np.copyto(seen, FRAME, where=covered)
-        return PartLabels(sealed(part), self.amodal, None if drawn is None else sealed(drawn))
+        drawn = None if self.annotated is None else frozen(np.where(covered, FRAME, self.annotated), np.uint8)
+        return replace(self, part=frozen(np.where(covered, FRAME, self.part), np.uint8), annotated=drawn)
 
     def visible_fraction(self, part: int, whole: float | None = None) -> float:
         """Compute the visible share of a part, of `whole` pixels or its amodal ones in the window; NaN if of none."""
