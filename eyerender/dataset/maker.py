@@ -95,8 +95,13 @@ class Maker:
                     yield found
 
         labels = self.plan.spec.labels
-        wanted = {"highlights": labels.highlights, "annotated": labels.as_annotated, "geometry": labels.geometry or ()}
-        images = begin_each(frames(), self.renderer, **wanted)
+        images = begin_each(
+            frames(),
+            self.renderer,
+            highlights=labels.highlights,
+            annotated=labels.as_annotated,
+            geometry=labels.geometry or (),
+        )
         for first in images:
             while not waiting[0].frames:
                 yield self._rest(waiting.popleft(), ())
