@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from ..base.arrays import Bools, Floats, frozen
 from ..base.jit import ensure_compiled
 from .glints.classification import EyeContext, classify_spots
-from .glints.deblending import give_edges, split_blends
+from .glints.deblending import split_blends
 from .glints.detection import Spots, detect_spots, search_reach, widest
 from .glints.fits import SpotFit
-from .glints.fitting import fit_spots
-from .glints.gaussian_model import Limits
+from .glints.fitting import Limits, fit_spots
 from .glints.patches import measure_patches
 from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
 from .preprocessing import DN, ImagePart, Prepared, prepare
@@ -127,7 +126,7 @@ def explained(prepared: Prepared, scored: ScoredCandidate, settings: ExtractionS
         clip_dn=prepared.clip_dn,
         linear=prepared.linear,
     )
-    measured = measure_patches(prepared, model.ellipse, search_reach(model.ellipse, settings), spots, fit)
+    measured = measure_patches(prepared, model.ellipse, search_reach(model.ellipse, settings), fit)
     accepted, rejected = classify_spots(measured, spots.patches_px, eye, settings)
     return Extraction(pupil=pupil, glints=accepted, rejected=rejected, noise=noise, shape=size)
 
@@ -206,10 +205,8 @@ def _fit_spots(prepared: Prepared, found: PupilCandidate, spots: Spots) -> tuple
     model = found.model
     known, limits = _background(found.image, model), _limits(prepared, model)
     starts = (spots.xy_px, spots.width_px, spots.height_dn)
-    broad = widest(model.sigma_px)
-    fitted = fit_spots(prepared.linear, known, *starts, limits)
-    fit = give_edges(fitted, model.sigma_px, broad, limits)
-    starts, fit = split_blends(prepared.linear, known, starts, fit, broad, limits)
+    fit = fit_spots(prepared.linear, known, *starts, limits)
+    starts, fit = split_blends(prepared.linear, known, starts, fit, widest(model.sigma_px), limits)
     xy, width, height = starts
     return replace(spots, xy_px=xy, width_px=width, height_dn=height), fit
 

@@ -22,7 +22,6 @@ from ..settings import ExtractionSettings
 from ..weights import glint_weights
 from .detection import optics_sigma
 from .fits import SpotFit
-from .prescreening import PIXEL
 
 # Largest counted steps by which the background is brighter than the iris; more is not worse, because the sclera is as
 # bright.
@@ -50,6 +49,7 @@ GROUNDS = (
 )
 # Features of an unambiguous glint, in the order of the reasons.
 USUAL = (0.0, 0.0, SIZES[1], 0.0, math.log(10.0), 1.0, 0.0, 0.0)
+PIXEL = 1.0 / 12.0  # variance of a pixel, px^2; without it a spot of one row of pixels would be a line
 _TURN = np.arange(24) * (np.pi / 12.0)
 _CIRCLE, _LINE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1), np.linspace(0.0, 1.0, 16)
 

@@ -16,7 +16,6 @@ from ..pupil.edges import nearest
 from ..pupil.glare import around
 from ..settings import ExtractionSettings
 from ..statistics import select
-from .prescreening import gaussian_like
 
 SMOOTH_PX = 0.7  # standard deviation of the Gaussian that smooths the image first
 MAX_SIGMA_PX = 8.0  # widest spot
@@ -40,15 +39,12 @@ class Spots:
         width_px: (n,) standard deviation, estimated from the area above half the height.
         height_dn: (n,) height above the surroundings.
         patches_px: (k, 2) peaks of bright patches that are not spots.
-        clutter: xy, width and height of spots that are not bell-shaped. They are not fitted, and the pixel model of the
-            pupil boundary ignores their pixels.
     """
 
     xy_px: Floats
     width_px: Floats
     height_dn: Floats
     patches_px: Floats
-    clutter: tuple[Floats, Floats, Floats]
 
 
 def detect_spots(
@@ -94,18 +90,12 @@ def detect_spots(
     keep = _parted(smooth, xy, size, 4.0 * noise)[: settings.max_glints + 8]
     xy, width, height = xy[keep], width[keep], height[keep]
     alone = _above_ring(smooth, xy, width) > RING_SHARE * height
-    bell = alone.copy()
     corner = np.array([x0, y0])
-    levels = (prepared.noise_dn, prepared.clip_dn)
-    bell[alone] = gaussian_like(linear, xy + corner, width, height, *levels, np.flatnonzero(alone))
-    patches = np.concatenate([patches, xy[~bell]])[: settings.max_glints]
-    clutter = alone & ~bell
     return Spots(
-        xy_px=xy[bell] + corner,
-        width_px=width[bell],
-        height_dn=height[bell],
-        patches_px=patches + corner,
-        clutter=(xy[clutter] + corner, width[clutter], height[clutter]),
+        xy_px=xy[alone] + corner,
+        width_px=width[alone],
+        height_dn=height[alone],
+        patches_px=np.concatenate([patches, xy[~alone]])[: settings.max_glints] + corner,
     )
 
 
@@ -204,7 +194,7 @@ def _parted(smooth: Image, xy: Floats, size: int, dip: float) -> Indices:
 
 def _no_spots() -> Spots:
     places, none = np.zeros((0, 2)), np.zeros(0)
-    return Spots(xy_px=places, width_px=none, height_dn=none, patches_px=places, clutter=(places, none, none))
+    return Spots(xy_px=places, width_px=none, height_dn=none, patches_px=places)
 
 
 def _opening(half: Image, size: int) -> Image:

@@ -14,57 +14,50 @@ import numpy as np
 
 from ...base.arrays import Bytes, Floats, Indices
 from ...optics.ellipse import Ellipse
-from ..preprocessing import DN, Image, Prepared
+from ..preprocessing import Image, Prepared
 from ..pupil.glare import around
 from ..statistics import median
-from .detection import Spots
 from .fits import SpotFit, joined
 
 # Share of the brightest level near the pupil, step between pixels, least pixels of a patch, most patches. First those
 # with a dull middle, as overloaded sensors show bright glints; then saturated ones, some pixels of which compression
 # lowers.
-BRIGHT = ((0.6, 2, 5, 8), (0.92, 1, 2, 24))
+BRIGHT = ((0.6, 2, 5, 8), (0.92, 1, 2, 10))
 LONGEST = 2.0  # longest side of a patch in semi-axes b of the pupil, its smear included
 HEAD = 0.8  # of the radius of the largest disc in a patch; smear along rows or columns of the sensor is narrower
 OUTLINE = (0.5, 0.75)  # shares of the height that outline a patch; the second parts patches that touch
 SOLID = 0.85  # least area of an outline over that of its convex hull, unless patches touch
-USUAL_PX = 2  # half the side of a spot whose fit failed
-POOR = 0.1  # residual, as a share of the visible height, with which a Gaussian does not describe a clipped spot
-_SQUARE = np.ones((3, 3), np.uint8)
+_SQUARE, _PIXEL = np.ones((3, 3), np.uint8), np.eye(2) / 12.0  # second moments of a pixel
 _AREA = 2.0 * math.pi * math.log(2.0)  # area of a Gaussian above half its height, in sigma^2
 Box = tuple[int, int, int, int]  # first and last column, first and last row
 
 
-def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, spots: Spots, fit: SpotFit) -> SpotFit:
+def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, fit: SpotFit) -> SpotFit:
     """Replace the fits of spots that are patches by patch measurements, and append patches without a spot.
+
+    A patch with a well-fitted spot is left to that fit.
 
     Args:
         prepared: the image.
         ellipse: the pupil.
         reach_px: distance from the pupil's centre within which patches count.
-        spots: the spots.
-        fit: their fits.
+        fit: the fits of the spots.
     """
     columns, rows = around(ellipse.centre_px, reach_px, prepared.linear.shape)
     crop, corner = prepared.linear[rows, columns], np.array([columns.start, rows.start])
-    fit = replace(fit, xy_px=np.where(fit.converged[:, None], fit.xy_px, spots.xy_px))
-    poor = ~fit.converged | ((fit.residual_dn > POOR * np.minimum(fit.amplitude_dn, DN)) & (fit.clipped > 0))
     longest, owner = max(LONGEST * float(ellipse.semi_axes_px[1]), 8.0), np.zeros(crop.shape, dtype=np.intp)
-    peaks = np.rint(np.concatenate([fit.xy_px[poor], spots.clutter[0]]) - corner).astype(np.intp)
-    peaks = np.clip(peaks, USUAL_PX, np.array(crop.shape[::-1]) - 1 - USUAL_PX)
-    boxes = [(x - USUAL_PX, x + USUAL_PX, y - USUAL_PX, y + USUAL_PX) for x, y in peaks.tolist()]
-    parts: list[SpotFit] = []
-    for left, right, top, bottom in [*_bright_boxes(crop, prepared.clip_dn, ellipse.centre_px - corner), *boxes]:
-        if max(right - left, bottom - top) < longest:
-            patch = _patch(crop, (left, right, top, bottom), prepared.clip_dn, owner, len(parts) + 1)
+    place = np.rint(fit.xy_px - corner).astype(np.intp).clip(0, np.array(crop.shape[::-1]) - 1)
+    good, parts = place[fit.converged], [fit.taken(np.zeros(0, dtype=np.intp))]
+    for left, right, top, bottom in _bright_boxes(crop, prepared.clip_dn, ellipse.centre_px - corner):
+        fitted = ((good >= (left, top)) & (good <= (right, bottom))).all(axis=1).any()
+        if max(right - left, bottom - top) < longest and not fitted:
+            patch = _patch(crop, (left, right, top, bottom), prepared.clip_dn, owner, len(parts))
             parts += [] if patch is None else [patch]
-    patches = joined([fit.taken(np.zeros(0, dtype=np.intp)), *parts])
-    place = np.rint(spots.xy_px - corner).astype(np.intp).clip(0, np.array(crop.shape[::-1]) - 1)
     own = owner[place[:, 1], place[:, 0]]
-    described = np.isin(np.arange(len(parts) + 1), own[~poor])
+    described = np.isin(np.arange(len(parts)), own[fit.converged])
     described[0] = True
-    patches = replace(patches, xy_px=patches.xy_px + corner).taken(np.flatnonzero(~described[1:]))
-    return joined([fit.taken(np.flatnonzero(described[own])), patches])
+    patches = joined(parts).taken(np.flatnonzero(~described[1:]))
+    return joined([fit.taken(np.flatnonzero(described[own])), replace(patches, xy_px=patches.xy_px + corner)])
 
 
 def _bright_boxes(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
@@ -107,18 +100,14 @@ def _patch(crop: Image, box: Box, clip_dn: float, owner: Indices, number: int) -
     if window[seed] >= clip_dn:
         core = _head(core)
         near = cv2.dilate(core, _SQUARE).view(bool)
-    ys, xs = np.nonzero(near)
-    weight = np.where(core[ys, xs] > 0, height, np.clip(window[ys, xs] - ground, 0.0, height))
-    weight /= weight.sum()
-    centre = np.array([weight @ xs, weight @ ys])
-    offset = np.stack([xs, ys]) - centre[:, None]
-    moments = (offset * weight) @ offset.T + np.eye(2) / 12.0
-    area = float(np.count_nonzero(core))
-    sigma2 = moments * (area / _AREA / math.sqrt(np.linalg.det(moments)))
+    light = np.where(core, height, np.minimum(np.maximum(window - ground, 0.0), height)) * near
+    m, area = cv2.moments(light), float(np.count_nonzero(core))
+    moments = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"] + _PIXEL
+    sigma2 = moments * (area / _AREA / math.sqrt(moments[0, 0] * moments[1, 1] - moments[0, 1] ** 2))
     return SpotFit(
-        xy_px=(centre + np.array([columns.start, rows.start]))[None],
+        xy_px=np.array([[m["m10"] / m["m00"] + columns.start, m["m01"] / m["m00"] + rows.start]]),
         # Of a saturated patch only the outline is known: each of its pixels is uncertain by its own size.
-        covariance=np.eye(2)[None] * (4.0 / 12.0 / math.sqrt(4.0 * math.pi * area)),
+        covariance=_PIXEL[None] * (4.0 / math.sqrt(4.0 * math.pi * area)),
         amplitude_dn=np.array([height]),
         sigma_px=np.sqrt(np.diagonal(sigma2))[None],
         background_dn=np.array([ground]),

@@ -13,7 +13,7 @@ from ..preprocessing import Image, ImagePart, Prepared
 from ..pupil.glare import around
 from .detection import Spots
 from .fits import SpotFit
-from .windows import LARGEST_PX, profile
+from .fitting import LARGEST_PX, profile
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.
@@ -34,15 +34,13 @@ def part_about(linear: Image, ellipse: Ellipse) -> ImagePart:
 
 
 def affected_pixels(prepared: Prepared, part: ImagePart, spots: Spots, which: Bools | None = None) -> Bools:
-    """Compute the mask (h, w) of a part's pixels affected by spots (`which`, or all), clutter or saturation.
+    """Compute the mask (h, w) of a part's pixels affected by spots (`which`, or all) or saturation.
 
     The extent of a spot follows from its detected height and width.
     """
     own = slice(None) if which is None else which
-    parts = zip((spots.xy_px[own], spots.width_px[own], spots.height_dn[own]), spots.clutter, strict=True)
-    xy, width, height = (np.concatenate(part) for part in parts)
-    radius = 1.2 * _reach(width, height, prepared.noise_dn) + 1.0
-    return _covered(part.linear, prepared.clip_dn, xy - np.array(part.corner), radius)
+    radius = 1.2 * _reach(spots.width_px[own], spots.height_dn[own], prepared.noise_dn) + 1.0
+    return _covered(part.linear, prepared.clip_dn, spots.xy_px[own] - np.array(part.corner), radius)
 
 
 def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools:

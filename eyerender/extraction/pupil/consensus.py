@@ -25,7 +25,7 @@ SAMPLES = 240
 POINTS_PER_PIECE = 3
 FINALISTS = 24  # random ellipses whose support is counted with all points
 CUT = 0.08  # share of the outline in a gap that is more than a glint's: a lid, lashes or a reflection cuts the outline
-ALL_AGREE = 0.85  # share of the highest support; the root mean square distance is then at most 0.39 of the tolerance
+ALL_SEEN = 0.9  # share of the outline that no lid or lashes hide
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -82,15 +82,15 @@ def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected
 def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance: float) -> Ellipse | None:
     """Choose the ellipse with the most support among those through all points and through random triples of arc pieces.
 
-    If all points are about as close to their ellipse as noise allows, no others are tried.
+    If the selection that settles from the ellipse through all points sees nearly the whole outline, no others are
+    tried.
     """
     points = edges.points_px
     whole = direct_fits(points[None])
-    a, b = whole[0, 2:4].tolist()
-    if _sane(a, b, candidate, shape):
-        most = points.shape[0] / math.sqrt(math.pi * (a + b))  # as if all points were on the ellipse
-        if _support(points, edges.normals, whole, tolerance)[0] > ALL_AGREE * most:
-            return Ellipse.of(whole[0])
+    if _sane(whole[0, 2], whole[0, 3], candidate, shape):
+        count, found, _, _, seen = _settled(points, edges.normals, whole[0], edges.sigma_px, tolerance)
+        if count >= 8 and seen[0] > ALL_SEEN and _sane(found[2], found[3], candidate, shape):
+            return Ellipse.of(found)
     fits = np.concatenate([whole, _random_fits(edges, candidate)])
     with np.errstate(invalid="ignore"):
         fits = fits[_sane(fits[:, 2], fits[:, 3], candidate, shape)]

@@ -10,7 +10,7 @@ A hypothesis is a dark blob with the boundary through the edges around it. Its s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -173,25 +173,39 @@ def _likeliest(work: Prepared, shape: Shape) -> ScoredCandidate | PupilResult:
 def hypotheses(work: Prepared, shape: Shape) -> Iterator[tuple[bool, PupilCandidate | str]]:
     """Yield boundaries, or why a candidate has none, and whether they come from a later pass.
 
-    1. the best candidate at a quarter of the scale, then those of a less reduced image, and those inside each that has
-       a dark core
-    2. the same in the smoothed image and at half and a quarter of the scale, where noise, texture, block compression
+    1. the best candidate at a quarter of the scale, in the image and in the smoothed image
+    2. candidates of a less reduced image, and those inside each that has a dark core
+    3. the same in the smoothed image and at half and a quarter of the scale, where noise, texture, block compression
        and sharpening are finer than the edges, and the spots of a ring light small
-    3. pupils that lids cut: circles as wide as flat blobs
-    4. pupils smaller than USUAL_PX, in the image enlarged twice, where a glint leaves some of their edge
+    4. pupils that lids cut: circles as wide as flat blobs
+    5. pupils smaller than USUAL_PX, in the image enlarged twice, where a glint leaves some of their edge
 
     A boundary is in pixels of the scale at which it was found.
     """
     whole: list[Candidate] = []
-    for image, limits in _looks(work, shape):
-        tried = whole if image is work else []
-        usual = replace(limits, least_px=max(limits.least_px, min(USUAL_PX / image.scale, 0.5 * limits.most_px)))
-        for candidates in (_large, find_candidates):
-            yield from ((image is not work, one) for one in _bounded(image, candidates(image, usual), limits, tried))
+    soft: list[Candidate] = []
+    yield from ((False, one) for one in _look(work, _large, shape, whole))
+    smooth = work.smoothed(SMOOTH_PX)
+    yield from ((True, one) for one in _look(smooth, _large, shape, soft))
+    yield from ((False, one) for one in _look(work, find_candidates, shape, whole))
+    yield from ((True, one) for one in _look(smooth, find_candidates, shape, soft))
+    for scale in SCALES:
+        if min(work.linear.shape) >= LEAST_SIDE * scale:
+            reduced, limits, tried = work.rescaled(scale), _at_scale(shape, scale), list[Candidate]()
+            for search in (_large, find_candidates):
+                yield from ((True, one) for one in _look(reduced, search, limits, tried))
     yield from ((True, one) for one in _bounded(work, list(_rounder(whole, shape)), shape, whole))
     if shape.least_px < USUAL_PX:
         large, small = work.rescaled(0.5), _at_scale(replace(shape, most_px=2.0 * USUAL_PX), 0.5)
         yield from ((True, one) for one in _bounded(large, find_candidates(large, small), small, []))
+
+
+def _look(
+    image: Prepared, search: Callable[[Prepared, Shape], list[Candidate]], shape: Shape, tried: list[Candidate]
+) -> Iterator[PupilCandidate | str]:
+    """Yield boundaries around the candidates of a search for pupils of at least USUAL_PX."""
+    usual = replace(shape, least_px=max(shape.least_px, min(USUAL_PX / image.scale, 0.5 * shape.most_px)))
+    return _bounded(image, search(image, usual), shape, tried)
 
 
 def _bounded(
@@ -207,15 +221,6 @@ def _bounded(
         if isinstance(found, PupilCandidate) and found.core_dn > 0.0:
             for inner in find_inside(work, found.inpainted, found.boundary.ellipse, shape):
                 yield find_boundary(work, inner, shape)
-
-
-def _looks(work: Prepared, shape: Shape) -> Iterator[tuple[Prepared, Shape]]:
-    """Return the image as it is, smoothed, and at half and quarter scale, and the sizes to search for there."""
-    yield work, shape
-    yield work.smoothed(SMOOTH_PX), shape
-    for scale in SCALES:
-        if min(work.linear.shape) >= LEAST_SIDE * scale:
-            yield work.rescaled(scale), _at_scale(shape, scale)
 
 
 def _at_scale(shape: Shape, scale: float) -> Shape:
