@@ -11,6 +11,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Bytes, Floats, Indices
 from ...base.jit import compiled, inlined
+from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, as_image
 from ..statistics import median, quantile_of
 from .candidates import Candidate
@@ -29,6 +30,11 @@ MIRRORED = 0.7
 # A ridge is too weak below this share of a strong one's slope. The pupil's edge has a third of its step in the shadow
 # of a lid. (0.1 gives the same answers on rendered eyes in lids, 0.35 loses one in twelve of `stress`.)
 WEAK = 0.2
+# Search for a boundary's double: the semi-axis b in the reduced image, px; least and largest distance in semi-axes a and
+# least in px (nearer, the double overlaps the pupil by more than 0.7); directions; edge points; the cosine between the
+# normals and the strength of the gradient as a share of the boundary's.
+COARSE_PX, NEAREST, NEAREST_PX, FARTHEST, DIRECTIONS, MOST_POINTS = 24.0, 0.35, 6.0, 1.3, 24, 40
+ALIKE, GHOST = 0.88, 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -260,3 +266,55 @@ def _filters(sigma: float) -> tuple[Floats, Floats]:
     smooth = np.exp(-0.5 * (t / sigma) ** 2)
     smooth /= smooth.sum()
     return smooth, t * smooth / (t * t * smooth).sum()
+
+
+def repeated_share(inpainted: Inpainted, ellipse: Ellipse, edges: EdgePoints, used: Bools, blur_px: float) -> float:
+    """Compute the largest share of a boundary's edge points that recur at one distance and direction.
+
+    In an exposure across a saccade, the pupil appears twice, and so does most of its edge. An iris, a lid or lamps
+    repeat parts of it only. The image is reduced so that the semi-axis b is COARSE_PX.
+
+    Args:
+        inpainted: the image.
+        ellipse: the boundary.
+        edges: edge points around it.
+        used: (n,) which of them belong to it.
+        blur_px: blur of the edge.
+    """
+    a, b = ellipse.semi_axes_px.tolist()
+    scale = max(b / COARSE_PX, 1.0)
+    columns, rows = around(ellipse.centre_px, (1.0 + FARTHEST) * a + 4.0 * scale, inpainted.linear.shape)
+    crop, _ = inpainted.cut(columns, rows)
+    size = (max(int(crop.shape[1] / scale), 1), max(int(crop.shape[0] / scale), 1))
+    gx, gy = _gradient(as_image(cv2.resize(crop, size, interpolation=cv2.INTER_AREA)), 1.5)
+    every = max(1, np.count_nonzero(used) // MOST_POINTS)
+    points = (edges.points_px[used][::every] - (columns.start, rows.start) + 0.5) / scale - 0.5
+    near = max(NEAREST * a, 3.5 * blur_px, NEAREST_PX) / scale
+    return _repeated(gx, gy, points, edges.normals[used][::every].copy(), near, FARTHEST * a / scale)
+
+
+@compiled("f4[:,::1], f4[:,::1], f8[:,::1], f8[:,::1], f8, f8")
+def _repeated(gx: Image, gy: Image, points: Floats, normals: Floats, near: float, far: float) -> float:
+    """Compute the share of points (n, 2) that recur at the best distance, from `near` to `far` px, and direction.
+
+    A point recurs if the gradient that far to either side of it points the same way and is not much weaker.
+    """
+    strength, best, distance = np.empty(points.shape[0]), 0, near
+    for i in range(strength.size):
+        x, y = points[i, 0], points[i, 1]
+        strength[i] = max(math.hypot(nearest(gx, x, y), nearest(gy, x, y)), 1e-3)
+    while distance < far:
+        for k in range(DIRECTIONS):
+            dx, dy = distance * math.cos(math.pi * k / DIRECTIONS), distance * math.sin(math.pi * k / DIRECTIONS)
+            count = 0
+            for i in range(strength.size):
+                for side in (-1.0, 1.0):
+                    x, y = points[i, 0] + side * dx, points[i, 1] + side * dy
+                    u, v = nearest(gx, x, y), nearest(gy, x, y)
+                    along = u * normals[i, 0] + v * normals[i, 1]
+                    if along > ALIKE * math.hypot(u, v) and along > GHOST * strength[i]:
+                        count += 1
+                        break
+            best = max(best, count)
+        distance += 1.5
+    return best / max(strength.size, 1)

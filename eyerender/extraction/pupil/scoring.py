@@ -33,8 +33,8 @@ from .refinement import PixelFit
 
 FAST: Literal["fast"] = "fast"
 REFINED: Literal["refined"] = "refined"
-# An ellipse of a few pixels whose inner half reflections cover by this share is never surer than UNSURE: their flanks
-# are as steep as its edge.
+# An ellipse of a few pixels whose inner half reflections cover by this share is never surer than UNSURE, because their
+# flanks are as steep as its edge; nor is one half of a double image.
 COVERED, UNSURE, FEW_PX = 0.7, 0.85, 14.0
 SCALES = (-2.0, 6.0)  # limits of the logarithm of the covariance's factor
 
@@ -146,6 +146,7 @@ def pupil_of(scored: ScoredCandidate, fit: PixelFit | None, settings: Extraction
     ellipse = found.boundary.ellipse if fit is None else fit.ellipse
     goodness = scored.goodness if fit is None else goodness_of(found, fit)
     sure = scored.confidence if fit is None else confidence(ellipse, goodness, REFINED)
+    sure = min(sure, UNSURE) if sure > UNSURE and found.is_double else sure
     if sure < settings.min_confidence:
         return PupilResult.missing("fit", f"the ellipse found is the pupil with a probability of only {sure:.2f}")
     covariance, method = (found.boundary.covariance, FAST) if fit is None else (fit.covariance, REFINED)
