@@ -11,6 +11,7 @@ import pytest
 from eyerender.cli.main import run
 from eyerender.extraction import extract
 from eyerender.extraction.pupil.search import SURE
+from eyerender.optics.ellipse import Ellipse, iou
 
 HEIGHT, WIDTH = 200, 200
 
@@ -139,3 +140,22 @@ def test_a_dark_ruff_at_the_rim_and_a_mirrored_window():
             assert pupil.ok
             assert np.hypot(*(pupil.ellipse.centre_px - centre)) < far  # half of the ruff's width
             assert _radius(pupil) == pytest.approx(28.0, rel=0.05)
+
+
+def _twice(rng: np.random.Generator) -> tuple[np.ndarray, list[Ellipse]]:
+    """An exposure across a saccade, with 35 to 65 % of the light after it; and the two pupils."""
+    turn, apart, share = rng.uniform(0, np.pi), rng.uniform(0.5, 1.2) * 28.0, rng.uniform(0.35, 0.65)
+    half = 0.5 * apart * np.array([np.cos(turn), np.sin(turn)])
+    places = [np.array([160.0, 120.0]) + side * half for side in (-1.0, 1.0)]
+    levels = (1.0 - share) * _eye(tuple(places[0])) + share * _eye(tuple(places[1]))
+    image = _camera(cv2.GaussianBlur(levels, (0, 0), 1.0), 1.2, rng)
+    return image, [Ellipse(place, np.array([28.0, 28.0]), 0.0) for place in places]
+
+
+def test_a_double_image_is_not_certain():
+    for seed in range(16):
+        image, pupils = _twice(np.random.default_rng(seed))
+        found = extract(image).pupil
+        right = found.ok and max(iou(found.ellipse, pupil) for pupil in pupils) > 0.9
+        assert right or found.confidence < SURE, seed
+    assert extract(_camera(_eye((160.0, 120.0)), 1.2, np.random.default_rng(0))).pupil.confidence > SURE

@@ -7,7 +7,6 @@ import pytest
 
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, REFINED, extract
-from eyerender.extraction.glints.prescreening import gaussian_like
 from eyerender.optics.ellipse import Ellipse, iou
 
 
@@ -52,40 +51,6 @@ def test_faint_pupils_are_found_and_their_irises_are_not_taken_for_them():
 def test_no_later_look_finds_a_pupil_where_no_eye_is():
     sure = [extract(ideal.draw_no_eye(seed)).pupil.confidence > 0.8 for seed in range(24)]
     assert sum(sure) <= 2  # a blurred ring-shaped letter is a dark iris with a bright pupil
-
-
-def _spots(rng: np.random.Generator, sigma: float, height: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """An image of spots at random phases on a slope, and their peak pixels."""
-    y, x = np.mgrid[:60, :300].astype(float)
-    image = 40.0 + 0.1 * x + rng.normal(0.0, noise, x.shape)
-    places = np.stack([np.arange(30, 300, 40), np.full(7, 30)], axis=-1) + rng.uniform(-0.5, 0.5, (7, 2))
-    for cx, cy in places:
-        image += height * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2) / sigma**2)
-    return image.astype(np.float32), np.rint(places)
-
-
-@pytest.mark.parametrize("sigma", [0.8, 1.5, 3.0])
-@pytest.mark.parametrize("guess", [0.8, 1.25])
-def test_glints_are_gaussian_like(sigma, guess):
-    # Widths are guessed from the area above half height, good to some 20 %.
-    image, places = _spots(np.random.default_rng(5), sigma, 100.0, 2.0)
-    width, height = np.full(7, guess * sigma), np.full(7, 95.0)
-    assert gaussian_like(image, places, width, height, 2.0, 250.0, np.arange(width.size)).all()
-
-
-def test_grains_of_skin_are_not_gaussian_like():
-    # The tops of correlated noise, with widths larger than its own grain, as detection sees them.
-    rng = np.random.default_rng(6)
-    image = (60.0 + rng.normal(0.0, 15.0, (60, 300))).astype(np.float32)
-    places = np.stack([np.arange(30, 300, 40), np.full(7, 30)], axis=-1).astype(float)
-    assert not gaussian_like(image, places, np.full(7, 2.5), np.full(7, 40.0), 1.0, 250.0, np.arange(7)).any()
-
-
-def test_clipped_spots_are_not_judged():
-    image, places = _spots(np.random.default_rng(7), 2.0, 600.0, 2.0)
-    # Two spots run into each other, and all that is left of the tops is a plateau.
-    image = np.minimum(np.maximum(image, np.roll(image, 3, axis=1)), np.float32(255.0))
-    assert gaussian_like(image, places, np.full(7, 4.0), np.full(7, 215.0), 2.0, 250.0, np.arange(7)).all()
 
 
 def test_a_highlight_of_bright_skin_is_no_glint():

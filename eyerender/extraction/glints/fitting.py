@@ -225,7 +225,7 @@ def _light_of_others(windows: Windows, s: int, theta: Floats, gone: Bools, noise
 
 @compiled(f"{WINDOWS}, i8, f8[::1], f8[::1]")
 def spot_slopes(windows: Windows, s: int, theta: Floats, rest: Floats) -> Floats:
-    """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of spot s and, in the last row, the residual.
+    """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of a spot; the last row is the residual.
 
     Args:
         windows: the windows.

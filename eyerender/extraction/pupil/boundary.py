@@ -24,7 +24,7 @@ RINGING_DN = 12.0  # darker spots beside a glint than this are not made by compr
 # Unevenness at which the pixel model has half the weight, and its weight below which it is not fitted. Drawn ellipses
 # scatter by up to 0.003 of the radius, also in textured irises; nearly all recorded pupils by 0.005 to 0.016.
 UNEVEN, LEAST_SHARE = 0.004, 0.05
-DOUBLE = 0.8  # share of a boundary that recurs in a double image; in eyes without one, up to 0.8 in 99 of 100
+DOUBLE = 0.8  # share of a boundary that recurs in a double image: drawn ones have 0.81 to 1, single ones up to 0.8
 LID = 0.3  # share of the outline in a gap between edge points that only a lid makes
 ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are detected again, around the boundary
 

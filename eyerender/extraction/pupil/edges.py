@@ -30,10 +30,11 @@ MIRRORED = 0.7
 # A ridge is too weak below this share of a strong one's slope. The pupil's edge has a third of its step in the shadow
 # of a lid. (0.1 gives the same answers on rendered eyes in lids, 0.35 loses one in twelve of `stress`.)
 WEAK = 0.2
-# Search for a boundary's double: the semi-axis b in the reduced image, px; least and largest distance in semi-axes a and
-# least in px (nearer, the double overlaps the pupil by more than 0.7); directions; edge points; the cosine between the
-# normals and the strength of the gradient as a share of the boundary's.
-COARSE_PX, NEAREST, NEAREST_PX, FARTHEST, DIRECTIONS, MOST_POINTS = 24.0, 0.35, 6.0, 1.3, 24, 40
+# Search for a boundary's double: the semi-axis b in the reduced image, px, directions, and about how many edge points.
+COARSE_PX, DIRECTIONS, MOST_POINTS = 24.0, 24, 40
+# Its distance in semi-axes a, and the least in px; one that is nearer hardly changes the pupil's outline.
+NEAREST, FARTHEST, NEAREST_PX = 0.35, 1.3, 6.0
+# Least cosine between its normals and the boundary's, and its least strength as a share of the boundary's.
 ALIKE, GHOST = 0.88, 0.25
 
 
