@@ -32,7 +32,7 @@ def _unexplained(fit: SpotFit, noise_dn: float) -> Bools:
     """Return whether the residual of spots (n,) is too large for a single glint, and small enough for two."""
     least = np.maximum(UNEXPLAINED * noise_dn, UNLIKE_BELL * fit.amplitude_dn)
     most = BESIDE_TWIN * np.minimum(fit.amplitude_dn, DN)
-    return np.asarray(fit.converged & (fit.residual_dn > least) & (fit.residual_dn < most))
+    return np.asarray((fit.residual_dn > least) & (fit.residual_dn < most))
 
 
 def split_blends(

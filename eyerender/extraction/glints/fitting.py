@@ -101,7 +101,7 @@ def fit_spots(
     flat = np.array([np.count_nonzero(clip[i:k]) for i, k in pairwise(first.tolist())], dtype=np.intp)
     good = settled & bell & np.isfinite(theta).all(axis=1) & (used >= LEAST_PIXELS) & (flat <= MOST_CLIPPED)
     return SpotFit(
-        xy_px=np.where(good[:, None], theta[:, :2], start_px),
+        xy_px=np.where(settled[:, None], theta[:, :2], start_px),
         covariance=covariance,
         amplitude_dn=height,
         sigma_px=np.exp(theta[:, 3:5]),

@@ -15,7 +15,7 @@ from ..settings import Shape
 from .candidates import BlobInterior, Candidate, candidate_at, inspect_interior
 from .consensus import BoundaryFit, fit_boundary
 from .edge_model import EdgeModel
-from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges, repeated_share
+from .edges import EdgePoints, edge_noise_px, filter_sigma, find_edges, is_repeated
 from .glare import Inpainted, inpaint_glints
 from .places import holding
 
@@ -24,7 +24,6 @@ RINGING_DN = 12.0  # darker spots beside a glint than this are not made by compr
 # Unevenness at which the pixel model has half the weight, and its weight below which it is not fitted. Drawn ellipses
 # scatter by up to 0.003 of the radius, also in textured irises; nearly all recorded pupils by 0.005 to 0.016.
 UNEVEN, LEAST_SHARE = 0.004, 0.05
-DOUBLE = 0.8  # share of a boundary that recurs in a double image: drawn ones have 0.81 to 1, single ones up to 0.8
 LID = 0.3  # share of the outline in a gap between edge points that only a lid makes
 ROUGH = 0.8  # overlap with its boundary below which a rough candidate's edges are detected again, around the boundary
 
@@ -100,8 +99,7 @@ class PupilCandidate:
     def is_double(self) -> bool:
         """Whether nearly all of the boundary recurs beside it, as in an exposure across a saccade."""
         found = self.boundary
-        share = repeated_share(self.inpainted, found.ellipse, self.edges, found.inliers, self.model.sigma_px)
-        return share > DOUBLE
+        return is_repeated(self.inpainted, found.ellipse, self.edges, found.inliers, self.model.sigma_px)
 
     @property
     def outline(self) -> Ellipse:
