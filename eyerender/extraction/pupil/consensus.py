@@ -21,7 +21,7 @@ from .edges import EdgePoints
 from .places import SECTORS, holding, relative_to, sector_at
 
 PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the boundary it joins
-SAMPLES = 160
+SAMPLES = 240
 POINTS_PER_PIECE = 3
 FINALISTS = 24  # random ellipses whose support is counted with all points
 CUT = 0.08  # share of the outline in a gap that is more than a glint's: a lid, lashes or a reflection cuts the outline
@@ -82,14 +82,15 @@ def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected
 def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance: float) -> Ellipse | None:
     """Choose the ellipse with the most support among those through all points and through random triples of arc pieces.
 
-    If the selection that settles from the candidate itself sees nearly the whole outline, no others are tried.
+    If the selection that settles from the ellipse through all points sees nearly the whole outline, no others are
+    tried.
     """
     points = edges.points_px
-    begun = np.array(candidate.ellipse.numbers())
-    count, found, _, _, seen = _settled(points, edges.normals, begun, edges.sigma_px, tolerance)
-    if count >= 8 and seen[0] > ALL_SEEN and _sane(found[2], found[3], candidate, shape):
-        return Ellipse.of(found)
     whole = direct_fits(points[None])
+    if _sane(whole[0, 2], whole[0, 3], candidate, shape):
+        count, found, _, _, seen = _settled(points, edges.normals, whole[0], edges.sigma_px, tolerance)
+        if count >= 8 and seen[0] > ALL_SEEN and _sane(found[2], found[3], candidate, shape):
+            return Ellipse.of(found)
     fits = np.concatenate([whole, _random_fits(edges, candidate)])
     with np.errstate(invalid="ignore"):
         fits = fits[_sane(fits[:, 2], fits[:, 3], candidate, shape)]

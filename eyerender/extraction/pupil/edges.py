@@ -35,8 +35,8 @@ COARSE_PX, DIRECTIONS, MOST_POINTS = 24.0, 24, 40
 # Its distance in semi-axes a, and the least in px; one that is nearer hardly changes the pupil's outline.
 NEAREST, FARTHEST, NEAREST_PX = 0.35, 1.3, 6.0
 # Least cosine between its normals and the boundary's, and its least strength as a share of the boundary's.
-ALIKE, GHOST = 0.88, 0.25
-DOUBLE = 0.8  # share of a boundary that recurs in a double image: drawn ones have 0.81 to 1, single ones up to 0.8
+ALIKE, GHOST = 0.92, 0.25
+DOUBLE = 0.7  # share of a boundary that recurs in a double image; drawn ones have 0.71 to 1
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
