@@ -311,7 +311,7 @@ LARGE = {
 # Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose
 # first fields users give in order.
 POSITIONAL = {
-    "Biconic", "BoundaryPixels", "CalibrationErrors", "Descent", "DeviceSurface", "EyeImage", "EyePicture",
+    "Biconic", "BoundaryPixels", "CalibrationErrors", "DeviceSurface", "EyeImage", "EyePicture",
     "Finding", "FunctionErrors", "GradientMedium", "GridSurface", "GuestrinEizenman", "LashPlan", "Patch", "Quadric",
     "RegionLayout", "RigGeometry",
     "Regression", "Scene", "Score", "Stop", "Table", "ZernikeSurface", "_Table",
