@@ -29,7 +29,7 @@ PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
 LARGEST_PX = 20.0  # radius of a window at most
 LOST_PX = 12.0  # a spot that becomes wider or moves farther is not a glint
 ROUND_SD = 0.3  # prior standard deviation of ln sx - ln sy: glints are nearly round
-ROUNDS, STEPS = 4, 8  # Levenberg-Marquardt steps of a spot in each round
+ROUNDS, STEPS = 12, 8  # Levenberg-Marquardt steps of a spot in each round
 # A descent ends when a step gains less, in squared standard deviations of the noise. That is also the squared length of
 # the step in standard deviations of the parameters.
 SMALL_GAIN = 5e-3
@@ -223,7 +223,7 @@ def _light_of_others(windows: Windows, s: int, theta: Floats, gone: Bools, noise
     return change
 
 
-@compiled(f"{WINDOWS}, i8, f8[::1], f8[::1]")
+@inlined
 def spot_slopes(windows: Windows, s: int, theta: Floats, rest: Floats) -> Floats:
     """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of a spot; the last row is the residual.
 
