@@ -15,7 +15,7 @@ from ...scene.parts import BACKGROUND, FRAME, IRIS, PUPIL, SCLERA, SPECTACLES
 from ..hits.eyeshape import EyeShape
 from ..hits.interaction import SurfaceInteraction, outer_albedo, tear_film
 from ..hits.meniscus import on_water
-from ..hits.primary import first_hit, hidden, hit_before, hit_past_hairs
+from ..hits.primary import TriangleHit, first_hit, hidden, hit_before, hit_past_hairs
 from ..integrator.hostdata import BoundFrame
 from ..integrator.sampling import Pixels, camera_ray
 from ..records.frame import DeviceFrame
