@@ -26,7 +26,7 @@ from ..rig.camera import PinholeCamera
 from ..rig.distortion import is_distorted
 from ..scene.observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from .occluders import Occluders
-from .rays import glint_exits, pupil_exits
+from .rays import glint_exits, lit_points, pupil_exits
 from .view_kernels import project_all, see_all
 
 
@@ -141,7 +141,9 @@ def features(
                     )
                     pixels, status = view.project(exits, status)
                     if occluders is not None:
-                        occluders.mark(status, pixels, view.in_world(exits), camera, lights[some])
+                        lit_mm = lit_points(turned, exits, view.into_eye(lights[some]), view.camera_mm, view.lenses)
+                        points_mm = view.in_world(exits)
+                        occluders.mark(status, pixels, points_mm, camera, lights[some], view.in_world(lit_mm))
                     at, lamp = np.ix_(block, some)
                     glints[at, lamp, j], glint_status[at, lamp, j] = pixels, status
                     glint_residual[at, lamp, j], glint_in_image[at, lamp, j] = residual, camera.in_image(pixels)

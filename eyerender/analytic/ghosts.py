@@ -34,7 +34,8 @@ def ghost_glint_features(
     for group, rows in groups(eyes, which):
         for number in numbers:
             camera = rig.cameras[number]
-            for block, eye in chunks(group, rows[index.camera[rows] == number], CHUNK_POINTS // 4):
+            own = rows[index.camera[rows] == number]
+            for block, eye in chunks(group, own, CHUNK_POINTS // 4) if len(own) else ():
                 turn = Poses(pose.azimuth_rad[block], pose.elevation_rad[block], pose.torsion_rad[block])
                 view = View.of(eye, turn, place[block], camera)
                 for k in range(m):

@@ -32,21 +32,28 @@ class Occluders:
         return cls(rig.bodies(), openings) if rig.obstacles or openings else None
 
     def mark(
-        self, status: Statuses, pixels: Floats, points_mm: Floats, camera: PinholeCamera, lights_mm: Floats | None
+        self,
+        status: Statuses,
+        pixels: Floats,
+        points_mm: Floats,
+        camera: PinholeCamera,
+        lights_mm: Floats | None,
+        lit_mm: Floats | None = None,
     ) -> None:
         """Mark, in place, the status of hidden features (n, k), and set their pixels (n, k, 2) to NaN.
 
         Args:
             status: of the features.
             pixels: their places in the camera's picture.
-            points_mm: (n, k, 3) where their light leaves the eyes, in the world.
+            points_mm: (n, k, 3) where their light leaves the eyes, or the lenses before them, in the world.
             camera: the camera.
             lights_mm: (k, 3) the light of each glint; None for other features.
+            lit_mm: (n, k, 3) where the light arrives on the corneas; default: `points_mm`. Its way there is straight.
         """
         if self.bodies:
             tree = tree_of(*self.bodies)
             mark(status, tree.blocks(camera.nodal_point_mm, points_mm), Status.BEHIND_OBSTACLE)
             if lights_mm is not None:
-                mark(status, tree.blocks(lights_mm, points_mm), Status.BEHIND_OBSTACLE)
+                mark(status, tree.blocks(lights_mm, points_mm if lit_mm is None else lit_mm), Status.BEHIND_OBSTACLE)
         mark(status, hidden_at(self.openings, camera, pixels), Status.BEHIND_OPENING)
         pixels[status != Status.OK] = np.nan

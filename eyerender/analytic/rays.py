@@ -114,6 +114,14 @@ def glint_exits(
     return components(found.exit_points_mm), found.residual_mm, status.astype(np.int8)
 
 
+def lit_points(eye: EyeModel, exits: Xyz, lights_mm: Xyz, camera_mm: Xyz, lenses: Sequence[WornLens]) -> Xyz:
+    """Compute where the light of lamps (n, m) that leaves at `exits` arrives on the cornea, past the lenses worn."""
+    if not lenses:
+        return exits
+    place = (camera_mm[0][:, None], camera_mm[1][:, None], camera_mm[2][:, None])
+    return mirrored_legs(eye, lenses, lights_mm, place).exit
+
+
 def _sees_no_cornea(eye: EyeModel, camera_mm: Xyz) -> Bools:
     """Return whether the camera is behind the tangent planes of the whole cornea, (n,); False if in doubt.
 

@@ -144,7 +144,7 @@ def lid_opening(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[st
     It is None for a bare eye and for a head mesh. At rest, the person's own lids neither shut nor squint nor are wide,
     and follow the same gaze.
     """
-    region, person = scene.region, scene.spec.person
+    region, person = scene.spec.region, scene.spec.person
     if region is None or region.head is not None:
         return None
     rest = region.with_lids()

@@ -38,6 +38,11 @@ class PictureSettings(Protocol):
         ...
 
     @property
+    def region(self) -> Region | None:
+        """Lids, lashes, brow and skin, as written: the files of a head mesh are relative to the scene's folder."""
+        ...
+
+    @property
     def image(self) -> Picture:
         """The rendered part of the sensor, and its samples."""
         ...

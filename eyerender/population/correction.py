@@ -10,7 +10,7 @@ Of those who wear a correction, 39 % (10 to 18 years), 37 % (18 to 40) and 5.7 %
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,8 +19,18 @@ from ..base.spec import EYES, Side
 from ..optics.transforms import inverse_2x2
 from .table import default_table
 
-if TYPE_CHECKING:
-    from .people import Person
+
+class Wearer(Protocol):
+    """What is asked of a person: see `people.Person`."""
+
+    def number(self, name: str, side: Side | None = None) -> float:
+        """Return a number of the person, or of one eye."""
+        ...
+
+    def draw_seed(self, purpose: str) -> int:
+        """Return a seed for something without a quantity in the table."""
+        ...
+
 
 NEEDED_D, NEEDED_CYLINDER_D = 0.75, 1.0
 """Refractive errors from which on people need a correction (chosen; the usual limits of prescribing)."""
@@ -29,7 +39,7 @@ _CONTACT_AGES, _CONTACT_SHARES = (18.0, 40.0, 50.0), (0.39, 0.37, 0.057)
 _VERTEX_MM = 13.0
 
 
-def at_cornea(person: Person, side: Side) -> Floats:
+def at_cornea(person: Wearer, side: Side) -> Floats:
     """Compute the refraction K (2, 2) of one eye at the cornea, dioptres along nasal and up."""
     mean, j0, j45 = (person.number(f"refraction_{part}", side) for part in ("d", "j0_d", "j45_d"))
     power = np.array([[mean + j0, j45], [j45, mean - j0]])
@@ -49,7 +59,7 @@ def prescription(power: Floats, side: Side) -> dict[str, float]:
     return {"sphere_d": float(mean + across), "cylinder_d": float(-2.0 * across), "axis_deg": float(axis)}
 
 
-def spectacles_of(person: Person, **keys: Any) -> dict[str, dict[str, Any]]:
+def spectacles_of(person: Wearer, **keys: Any) -> dict[str, dict[str, Any]]:
     """Return `spectacles` with the prescription of each eye and the same other keys (`SpectacleLens`).
 
     Args:
@@ -64,13 +74,13 @@ def spectacles_of(person: Person, **keys: Any) -> dict[str, dict[str, Any]]:
     return out
 
 
-def contact_lens_of_person(person: Person, **keys: Any) -> dict[str, dict[str, Any]]:
+def contact_lens_of_person(person: Wearer, **keys: Any) -> dict[str, dict[str, Any]]:
     """Return `contact_lens` with the power of each eye and the same other keys (`ContactLens`)."""
     powers = {side: 0.5 * float(np.trace(at_cornea(person, side))) for side in EYES}
     return {side: {"power_d": power, **keys} for side, power in powers.items()}
 
 
-def worn_by(person: Person, share: float) -> dict[str, Any]:
+def worn_by(person: Wearer, share: float) -> dict[str, Any]:
     """Return the keys `spectacles` or `contact_lens` of a person, or none.
 
     Args:

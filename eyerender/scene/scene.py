@@ -32,7 +32,7 @@ from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..eye.spectacles import SpectacleLens, demand_through_d, lenses_of
 from ..population.eyes import amplitude_d
-from ..population.people import Person
+from ..population.people import Person, PopulationSpec
 from ..population.response import REFERENCE_AGE, responding
 from ..population.table import default_table
 from ..region.anatomy import Region
@@ -539,6 +539,14 @@ class Scene:
         """Raise an `InputError` for a scene with spectacles, which `what` does not follow."""
         if self.spec.subject.spectacles is not None:
             raise InputError(f"{what} without spectacles so far", source=self.source, path="subject.spectacles")
+
+    def refuse_lenses(self, what: str, population: PopulationSpec) -> None:
+        """Raise an `InputError` where people would wear spectacles or contact lenses, which `what` does not follow."""
+        self.refuse_spectacles(what)
+        if self.spec.subject.contact_lens is not None:
+            raise InputError(f"{what} without contact lenses so far", source=self.source, path="subject.contact_lens")
+        if population.corrected:
+            raise InputError(f"{what} without glasses so far", path="population.corrected")
 
     @property
     def accommodation_d(self) -> float | None:

@@ -17,8 +17,8 @@ EXCEPTIONS = {
     "dataset.packing._write_tar": "the pictures of this run",
     "dataset.partial.PartialShard._sort_lines": "the lines of this run",
     "dataset.assemble.LineTable._lines": "shards that were just verified",
+    "dataset.lines.ShardLines.of": "lines whose places were just found by `index`; their checksum is compared",
     "dataset.run.Run._assembled": "a dataset that was just verified",
-    "eye.biometry._adult": "an eye file of the package",
     "OwnEstimator.load": "imports a class that the caller names",
 }
 

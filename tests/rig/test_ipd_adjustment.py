@@ -39,7 +39,7 @@ def test_a_camera_takes_its_mirror_along_and_the_mount_comes_last():
     mirror = {"point_mm": [30.0, -31.5, 0.0], "normal": [1.0, 0.3, 0.2]}
     changes = {
         "rig.cameras.0.mirror": mirror, "rig.cameras.0.eyes": ["right"], "rig.mount": {"rotation_deg": [5, 0, 3]},
-        "rig.ipd_adjust": {"range_mm": [50, 80]},
+        "rig.ipd_adjust": {"range_mm": [50, 80]}, "rig.obstacles": [],
     }  # fmt: skip
     rig = er.load_scene("headset").with_(changes).spec.rig
     moved, still = rig.build(69.0), rig.build(63.0)

@@ -85,7 +85,7 @@ def compare_rigs(
     if len(scenes) < 2:
         raise InputError("needs two rigs", path="scenes")
     for scene in scenes:
-        scene.refuse_spectacles("rigs are compared")
+        scene.refuse_lenses("rigs are compared", population)
     people = _evaluated(scenes, population, size, progress)
     subjects = people[0].figures.subject
     if len(subjects) < 2:

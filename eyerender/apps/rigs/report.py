@@ -96,7 +96,7 @@ def run_rig(
     Raises:
         InputError: the folder is not empty, no drawn eye is physically possible, or a tolerance is that of no part.
     """
-    scene.refuse_spectacles("rigs are reported on")
+    scene.refuse_lenses("rigs are reported on", population)
     whole, scene = scene, scene.of_first_eye()
     survey = survey_of(scene, population, size, unknowns)
     own = None if tolerances is None else of_this_eye(whole, tolerances)

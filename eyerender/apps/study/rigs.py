@@ -200,7 +200,7 @@ def traits_of(found: Figures, preset: str = "adults", seed: int = 0) -> dict[str
     return out
 
 
-def thirds(lost: Bools, values: Floats) -> list[float]:
-    """Compute the share of lost directions in the thirds of people with low, middle and high values."""
+def thirds(lost: Bools, values: Floats) -> list[float | None]:
+    """Compute the share of lost directions in the thirds of people with low, middle and high values; None of nobody."""
     order = np.argsort(values, kind="stable")
-    return [float(lost[part].mean()) if len(part) else float("nan") for part in np.array_split(order, 3)]
+    return [float(lost[part].mean()) if len(part) else None for part in np.array_split(order, 3)]

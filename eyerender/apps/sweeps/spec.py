@@ -130,7 +130,7 @@ class SweepSpec(FileSpec):
         """Load the base scene, from a file relative to a folder or a shipped one."""
         beside = folder / self.scene
         scene = load_scene(beside if beside.is_file() else self.scene)
-        scene.refuse_spectacles("layouts are swept")
+        scene.refuse_lenses("layouts are swept", self.people_of())
         return scene
 
 

@@ -46,7 +46,9 @@ class Preparation:
         if self.encoding not in ("stored", "linear"):
             raise InputError(f"must be 'stored' or 'linear', not {self.encoding!r}", path="encoding")
         size = self.size
-        if size is not None and not (len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)):
+        if size is not None and not (
+            isinstance(size, tuple | list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)
+        ):
             raise InputError(f"must be (width, height) in pixels, not {size!r}", path="size")
         if self.lights is not None and self.lights < 0:
             raise InputError(f"must be >= 0, not {self.lights}", path="lights")
