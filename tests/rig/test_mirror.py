@@ -217,6 +217,17 @@ def test_ghosts_are_in_records_and_not_among_glints():
     assert not both.ghost_glints.ok[: len(plain)].any()
 
 
+def test_ghosts_of_cameras_that_each_see_one_eye():
+    """Each camera has its own rows, and none of the other eye."""
+    cameras = [
+        dict(scene(mirror=GLASS).spec.to_mapping()["rig"]["cameras"][0], eyes=[side]) for side in ("right", "left")
+    ]
+    both = scene(mirror=GLASS).with_({"rig.cameras": cameras, "subject.eyes": ["right", "left"]})
+    seen = er.trace(both.frames())
+    assert seen.ghost_glints is not None
+    assert set(zip(seen.index.camera.tolist(), seen.index.eye.tolist(), strict=True)) == {(0, 0), (1, 1)}
+
+
 def small(centre_px: np.ndarray, half_px: float) -> dict[str, object]:
     """A mirror whose outline is a square in the picture of the plain mirror."""
     camera, (normal, offset) = scene(mirror=MIRROR).rig.cameras[0], Mirror.from_mapping(MIRROR).plane
