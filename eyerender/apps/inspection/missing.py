@@ -14,6 +14,7 @@ from .statistics import rank_correlations
 
 _LEAST = 0.02
 _LEVELS = 8
+_SIDES = ("eye", "camera")
 
 
 class MissingLabels(NamedTuple):
@@ -26,13 +27,20 @@ class MissingLabels(NamedTuple):
 
 
 def missing_labels(contents: Contents) -> list[MissingLabels]:
-    """List the labels that more than 2 % of the images lack, the most frequent lack first."""
+    """List the labels that more than 2 % of the images lack, the most frequent lack first.
+
+    A label counts among the images of those cameras and eyes that have it at all: many LEDs light one eye alone.
+    """
     readable = np.array([bool(name) for name in contents.names], dtype=bool)
-    lacking: dict[bytes, list[str]] = {}
+    sides = [np.array([str(v) for v in contents.groups[key]])[readable] for key in _SIDES if key in contents.groups]
+    lacking: dict[tuple[bytes, bytes], list[str]] = {}
     for name, column in contents.columns.items():
-        gone = ~np.isfinite(column[readable])
-        if name.startswith(LABEL) and gone.mean() > _LEAST:
-            lacking.setdefault(gone.tobytes(), []).append(name)
+        there = np.isfinite(column[readable])
+        asked = np.ones(len(there), dtype=bool)
+        for values in sides if there.any() else ():
+            asked &= np.isin(values, values[there])
+        if name.startswith(LABEL) and not there[asked].mean() >= 1.0 - _LEAST:
+            lacking.setdefault(((~there).tobytes(), asked.tobytes()), []).append(name)
     # What labels are missing from is looked for in draws, people, angles, lengths and groups, not in other labels.
     causes = {
         name: column.astype(float)
@@ -40,9 +48,10 @@ def missing_labels(contents: Contents) -> list[MissingLabels]:
         if name.startswith((DRAW, PERSON)) or name.endswith(("(deg)", "(mm)"))
     } | levels(contents.groups)
     found = []
-    for pattern, names in lacking.items():
-        gone = np.frombuffer(pattern, dtype=bool)
-        columns = [gone.astype(float), *(column[readable] for column in causes.values())]
+    for (pattern, asking), names in lacking.items():
+        asked = np.frombuffer(asking, dtype=bool)
+        gone = np.frombuffer(pattern, dtype=bool)[asked]
+        columns = [gone.astype(float), *(column[readable][asked] for column in causes.values())]
         rho = np.nan_to_num(rank_correlations(np.stack(columns, axis=1))[0, 1:])
         most = int(np.argmax(np.abs(rho))) if np.any(rho) else None
         cause, value = (None, 0.0) if most is None else (list(causes)[most], float(rho[most]))
