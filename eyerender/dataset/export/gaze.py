@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..training.item import LEAST_SHOWN
+
 DIRECTIONS = ("line_of_sight", "optic_axis")
 CARD = """
 ## Gaze
@@ -22,6 +24,8 @@ eye outwards.{columns}
 `*_yaw_deg` = atan2(-x, -z) and `*_pitch_deg` = asin(-y), in degrees: both are 0 for gaze parallel to the camera's axis,
 towards the camera; yaw is positive to the image's left, and pitch is positive up (as in MPIIGaze and ETH-XGaze). Lens
 distortion, the position of the eye and the roll of the head are not removed.
+
+`gaze_valid` is 0 while under a tenth of the pupil shows, as of a shut eye: gaze and pupil are then known, but not seen.
 
 `pupil_entrance_diameter_mm` is the entrance pupil, as seen through the cornea on the optic axis;
 `pupil_stop_diameter_mm` is the anatomical pupil (also in `pupil_diameter_mm`).
@@ -35,13 +39,14 @@ def yaw_pitch_deg(direction: Sequence[float]) -> tuple[float, float]:
 
 
 def gaze_of(line: dict[str, Any]) -> dict[str, float]:
-    """Return yaw and pitch in degrees of the line of sight and the optic axis, by column name."""
-    space = line["labels"]["space"]["camera"]
-    return {
+    """Return yaw and pitch in degrees of the line of sight and the optic axis, and whether the eye shows them."""
+    space, shown = line["labels"]["space"]["camera"], line["labels"]["pupil"]["visible_fraction"]
+    angles = {
         f"{name}_{angle}_deg": value
         for name in DIRECTIONS
         for angle, value in zip(("yaw", "pitch"), yaw_pitch_deg(space[name]), strict=True)
     }
+    return {**angles, "gaze_valid": int((shown or 0.0) >= LEAST_SHOWN)}
 
 
 def pupil_of(line: dict[str, Any]) -> dict[str, float]:
