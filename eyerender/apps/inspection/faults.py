@@ -7,7 +7,7 @@ from dataclasses import dataclass
 KINDS = {
     "line": "the line of metadata cannot be read, or lacks labels",
     "label": "a label is missing where its status says that it exists, or is out of its range",
-    "file": "the picture is missing or cannot be read",
+    "file": "the picture is missing or cannot be read, or another file that its line names is missing",
     "size": "the picture or a mask has another size than the window",
     "black": "the picture is black",
     "white": "the picture is white",

@@ -13,7 +13,7 @@ from PIL import Image
 
 from ...base.arrays import Bytes
 from ...base.errors import InputError
-from ...folders.imagefolder import ImageEntry
+from ...folders.imagefolder import FILE_KEYS, ImageEntry
 from ...scene.parts import IRIS, PUPIL, SPECTACLES
 from .faults import Fault
 from .figures import PICTURE, SATURATED
@@ -61,6 +61,7 @@ def measure(entry: ImageEntry) -> PictureSummary:
         faults.append(Fault("file", error.reason))
         return nothing
     assert found is not None
+    faults += _absent(entry)
     image, stored = found
     width, height = entry.window[2:]
     if image.shape != (height, width):
@@ -99,6 +100,16 @@ def _blank(thumbnail: Bytes) -> Iterator[Fault]:
     mean = float(levels.mean())
     kind = "black" if mean < _BLACK else "white" if mean > _WHITE else "flat"
     yield Fault(kind, f"all of it has {mean:.1%} of the full scale")
+
+
+def _absent(entry: ImageEntry) -> Iterator[Fault]:
+    """Name further files of an image that its line names and that do not exist; those of a tar are read with it."""
+    for key in FILE_KEYS if entry.members is None else ():
+        if key not in ("file_name", "mask_file_name"):
+            try:
+                entry.check(key)
+            except InputError as error:
+                yield Fault("file", f"{key.removesuffix('_file_name')}: {error.reason}")
 
 
 def _mask(entry: ImageEntry, shape: tuple[int, ...], faults: list[Fault]) -> Bytes | None:
