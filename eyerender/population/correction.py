@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..base.arrays import Floats
 from ..base.spec import EYES, Side
-from ..optics.transforms import inverse_2x2
+from ..eye.spectacles import SpectacleLens
+from .refraction import Power, mapped
 from .table import default_table
 
 
@@ -36,23 +36,22 @@ NEEDED_D, NEEDED_CYLINDER_D = 0.75, 1.0
 """Refractive errors from which on people need a correction (chosen; the usual limits of prescribing)."""
 MOST_CONTACT_D = 15.0
 _CONTACT_AGES, _CONTACT_SHARES = (18.0, 40.0, 50.0), (0.39, 0.37, 0.057)
-_VERTEX_MM = 13.0
 
 
-def at_cornea(person: Wearer, side: Side) -> Floats:
-    """Compute the refraction K (2, 2) of one eye at the cornea, dioptres along nasal and up."""
-    mean, j0, j45 = (person.number(f"refraction_{part}", side) for part in ("d", "j0_d", "j45_d"))
-    power = np.array([[mean + j0, j45], [j45, mean - j0]])
-    return np.asarray(power @ inverse_2x2(np.eye(2) - 1e-3 * default_table().constant("vertex_mm") * power))
+def at_cornea(person: Wearer, side: Side) -> Power:
+    """Compute the refraction K of one eye at the cornea: (M, J0, J45) in dioptres, about nasal towards up."""
+    mean, j0, j45 = (np.array(person.number(f"refraction_{part}", side)) for part in ("d", "j0_d", "j45_d"))
+    d = 1e-3 * default_table().constant("vertex_mm")
+    return mapped((mean, j0, j45), lambda power: power / (1.0 - d * power))
 
 
-def prescription(power: Floats, side: Side) -> dict[str, float]:
-    """Write a power matrix (2, 2), dioptres along nasal and up, as an optician does, with a minus cylinder.
+def prescription(power: Power, side: Side) -> dict[str, float]:
+    """Write a power (M, J0, J45) in dioptres as an optician does, with a minus cylinder.
 
     The axis counts counter-clockwise as seen by somebody who faces the wearer. Nasal is at that person's right for a
     right eye and at the left for a left eye, so the axis of a left eye runs the other way about.
     """
-    mean, j0, j45 = (power[0, 0] + power[1, 1]) / 2, (power[0, 0] - power[1, 1]) / 2, power[0, 1]
+    mean, j0, j45 = power
     across = np.hypot(j0, j45)
     axis = np.degrees(0.5 * np.arctan2(j45, j0))
     axis = (axis if side == "right" else 180.0 - axis) % 180.0
@@ -66,18 +65,16 @@ def spectacles_of(person: Wearer, **keys: Any) -> dict[str, dict[str, Any]]:
         person: the person.
         keys: keys of the lenses, such as `vertex_mm` or `material`.
     """
-    v = 1e-3 * float(keys.get("vertex_mm", _VERTEX_MM))
+    v = 1e-3 * float(keys.get("vertex_mm", SpectacleLens.model_fields["vertex_mm"].default))
     out: dict[str, dict[str, Any]] = {}
     for side in EYES:
-        k = at_cornea(person, side)
-        out[side] = {**prescription(k @ inverse_2x2(np.eye(2) + v * k), side), **keys}
+        out[side] = {**prescription(mapped(at_cornea(person, side), lambda k: k / (1.0 + v * k)), side), **keys}
     return out
 
 
 def contact_lens_of_person(person: Wearer, **keys: Any) -> dict[str, dict[str, Any]]:
     """Return `contact_lens` with the power of each eye and the same other keys (`ContactLens`)."""
-    powers = {side: 0.5 * float(np.trace(at_cornea(person, side))) for side in EYES}
-    return {side: {"power_d": power, **keys} for side, power in powers.items()}
+    return {side: {"power_d": float(at_cornea(person, side)[0]), **keys} for side in EYES}
 
 
 def worn_by(person: Wearer, share: float) -> dict[str, Any]:

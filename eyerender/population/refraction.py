@@ -91,7 +91,7 @@ def solve(eyes: Biometry) -> Optics:
     """Compute the corneal astigmatism and the lens index of eyes with drawn refractions."""
     cornea, aqueous, _ = _indices(eyes.wavelength_nm)
     mean, j0, j45 = (np.asarray(p) / 1000.0 for p in eyes.refraction)
-    at_cornea = _mapped((mean, j0, j45), lambda v: v / (1.0 - eyes.vertex_mm * v))
+    at_cornea = mapped((mean, j0, j45), lambda v: v / (1.0 - eyes.vertex_mm * v))
     back = (
         (aqueous - cornea) / eyes.posterior_radius_mm,
         eyes.posterior_astigmatism_d[0] / 1000.0,
@@ -153,10 +153,10 @@ def _indices(wavelength_nm: float) -> tuple[float, float, float]:
 def _before(behind: Floats, back: Power, share: Floats) -> Power:
     """Compute the vergence in front of the cornea's thickness that becomes `behind` after its back surface."""
     zero = np.zeros_like(behind)
-    return _mapped((behind - back[0], zero - back[1], zero - back[2]), lambda v: v / (1.0 + share * v))
+    return mapped((behind - back[0], zero - back[1], zero - back[2]), lambda v: v / (1.0 + share * v))
 
 
-def _mapped(power: Power, f: Callable[[Floats], Floats]) -> Power:
+def mapped(power: Power, f: Callable[[Floats], Floats]) -> Power:
     """Apply a function to a power matrix, through its two eigenvalues."""
     m, a, b = power
     r = np.hypot(a, b)

@@ -61,7 +61,7 @@ class Preparation:
     @property
     def reads_labels(self) -> bool:
         """Whether more of a line is needed than what finds its pictures."""
-        return self.mirror_left or self.augment is not None or not set(self.parts) <= PICTURES.keys()
+        return self.flags or not set(self.parts) <= PICTURES.keys()
 
     def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:
         """Read an item; left eyes are mirrored if asked for.
