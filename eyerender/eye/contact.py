@@ -84,7 +84,9 @@ class ContactLens(Spec):
             front = self._front(eye.front[0], thickness, shift)
             edge = _thinnest_mm(front, eye.front[0], limbus)
         if not edge > 0.0:
-            raise InputError("the lens is thinner than nothing before the limbus; make it thicker", path="thickness_mm")
+            raise InputError(
+                "the front of the lens meets the cornea before the limbus; make it thicker", path="thickness_mm"
+            )
         worn = replace(
             eye, front=(front, *eye.front), front_indices=(self.index, *eye.front_indices), has_contact_lens=True
         )

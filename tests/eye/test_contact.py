@@ -94,7 +94,7 @@ def test_a_lens_is_thick_enough_over_the_limbus_or_refused():
     y, z = np.array(limbus), np.array(0.0)
     rim = axis + thin.front[0].local_sag(y, z) - eye.front[0].local_sag(y, z)
     assert rim == pytest.approx(EDGE_MM, abs=2e-4)
-    with pytest.raises(InputError, match="thickness_mm: the lens is thinner than nothing"):
+    with pytest.raises(InputError, match="thickness_mm: the front of the lens meets the cornea before the limbus"):
         ContactLens(power_d=6.0, thickness_mm=0.1).worn_by(eye)
     with pytest.raises(InputError, match="diameter_mm: must reach over the cornea"):
         ContactLens(diameter_mm=12.0, decentration_mm=(1.0, 0.0)).worn_by(eye)
