@@ -26,7 +26,7 @@ from .renderable import RenderableFrames, RenderableScene, RenderableSource, pos
 
 if TYPE_CHECKING:
     from ..rendering.output.window import RenderedWindow
-    from ..rendering.records.job import RenderJob
+    from ..rendering.records.job import RenderJob, SubFrames
     from ..rendering.renderer import Renderer
 
 # For one image, this is a day's work for a fast processor.
@@ -196,7 +196,7 @@ class _Step:
     frames: RenderableFrames
     row: int
     job: RenderJob
-    moments: tuple[RenderJob, ...]
+    moments: tuple[SubFrames, ...]
 
 
 def _steps(many: Iterable[RenderableFrames], wanted: dict[str, Any]) -> Iterator[_Step]:
@@ -271,11 +271,13 @@ def focus_dpt(frames: RenderableFrames, row: int) -> float:
     return max(target, far)
 
 
-def moments(frames: RenderableFrames, row: int, middle: RenderJob) -> tuple[RenderJob, ...]:
+def moments(frames: RenderableFrames, row: int, middle: RenderJob) -> tuple[SubFrames, ...]:
     """Return the job at evenly spaced moments of the exposure, with moving eye and head; empty if nothing moves.
 
     An interlaced camera has one exposure for its even rows, and a second one for its odd rows.
     """
+    from ..rendering.records.job import SubFrames
+
     scene, pose = frames.scene, frames.pose
     motion, sensor = scene.spec.motion, scene.spec.sensor
     if motion is None:
@@ -292,7 +294,11 @@ def moments(frames: RenderableFrames, row: int, middle: RenderJob) -> tuple[Rend
         # The middle moment is the job itself, so the renderer need not set it up again.
         moved = {"M": M[0], "t": t[0] + apex, "apex_mm": apex} if time_s else {}
         out.append(replace(middle, **moved, seed=seed, labels=False))
-    return tuple(out)
+    if not delay:
+        return (SubFrames(jobs=tuple(out)),)
+    odd = (np.arange(middle.window[3]) + middle.window[1]) % 2.0
+    first, second = tuple(out[: motion.steps]), tuple(out[motion.steps :])
+    return SubFrames(jobs=first, rows=1.0 - odd), SubFrames(jobs=second, rows=odd)
 
 
 def check_windows(scene: RenderableScene) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Singles
+from ..base.arrays import Bools, Floats, Singles, frozen
 from .glints.splatting import MirrorImages, Shine
 from .integrator.film import coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
@@ -18,7 +17,7 @@ from .integrator.hostdata import BoundFrame, HostData
 from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, annotated_parts, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
-from .records.job import RenderJob
+from .records.job import RenderJob, SubFrames
 from .records.recording import uncollected
 from .scene.background import Background
 from .scene.blur import Blur
@@ -44,14 +43,14 @@ class Renderer:
         self._beside = ThreadPoolExecutor(1, "develop")
         self._builder = FrameBuilder(self._beside)
 
-    def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[RenderJob] = ()) -> RenderedWindow:
+    def render(self, job: RenderJob, *, spp: int | None = None, moments: Sequence[SubFrames] = ()) -> RenderedWindow:
         """Render one window.
 
         Args:
             job: the job to render.
             spp: samples per pixel; None: the renderer's default.
-            moments: sub-frames of an exposure with motion. The image is their mean, and they share the samples; labels,
-                glints and margins are those of `job`, at mid-exposure.
+            moments: sub-frames of an exposure with motion, which share the samples. Glints and margins are those of
+                `job`, at mid-exposure; so are raster labels, where no sub-frame gives them.
 
         Raises:
             InputError: numbers so extreme that the image is not finite.
@@ -63,7 +62,7 @@ class Renderer:
         job: RenderJob,
         *,
         spp: int | None = None,
-        moments: Sequence[RenderJob] = (),
+        moments: Sequence[SubFrames] = (),
         after: RenderJob | None = None,
     ) -> Future[RenderedWindow]:
         """Trace a window now; lens and sensor run in a second thread while the next window is traced.
@@ -81,35 +80,38 @@ class Renderer:
 
     @uncollected
     def _traced(
-        self, job: RenderJob, spp: int | None, moments: Sequence[RenderJob], after: RenderJob | None
+        self, job: RenderJob, spp: int | None, moments: Sequence[SubFrames], after: RenderJob | None
     ) -> RawFrame:
-        """Trace a job, or average its sub-frames; take labels and glints from mid-exposure."""
-        shots = moments or (job,)
-        # The sub-frames of an interlaced camera are two exposures.
-        count = len(shots) // (2 if moments and job.sensor.field_delay_ms else 1)
-        spp = max(1, (spp or self.spp) // count)
+        """Trace a job, or the sub-frames of its exposure; take labels and glints from mid-exposure."""
+        parts = moments or (SubFrames(jobs=(job,)),)
+        shots = [(shot, part) for part in parts for shot in part.jobs]
+        spp = max(1, (spp or self.spp) // _shots_of_a_row(parts))
         blur: Blur | None = None
-        pictures: list[Singles] = []
+        pictures: dict[int, list[Singles]] = {id(part): [] for part in parts}
+        glints: dict[int, list[Shine]] = {id(part): [] for part in parts}
         failed = 0
-        glints: list[Sequence[Shine]] = []
         marks: tuple[Any, ...] | None = None
+        rows: list[tuple[Bools, PartLabels]] = []
         around: Callable[[], Singles] | None = None
-        for shot in shots:
+        for shot, part in shots:
             bound, surroundings = self._builder.set(shot, after=None if moments else after)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
             means = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
-            if shot is shots[len(shots) // 2]:
+            if shot is shots[len(shots) // 2][0]:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
-            found = _marks(bound, job, surroundings) if shot.M is job.M and shot.t is job.t else None
+            found = _marks(bound, job, surroundings) if _is_middle(shot, job) else None
+            own = None if part.labelled is None else part_labels(bound, job.window)
             self._builder.prepare()
-            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / count)
-            glints.append(shines)
+            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(part.jobs))
+            glints[id(part)] += shines
             mean, missed = means()
-            pictures.append(mean)
+            pictures[id(part)].append(mean)
             failed += missed
             if found is not None:
                 marks = mirrored, *found()
+            if own is not None and part.labelled is not None:
+                rows.append((part.labelled, own()))
         assert blur is not None
         if marks is None:  # no sub-frame is at mid-exposure
             bound, surroundings = self.bind(job, lit=False)
@@ -117,13 +119,14 @@ class Renderer:
         mirrored, labels, margins, bright, hits = marks
         exposed = tuple(
             Exposed(
-                np.mean(pictures[k : k + count], axis=0) if moments else pictures[0],
-                tuple(chain(*glints[k : k + count])),
+                np.mean(pictures[id(part)], axis=0) if len(part.jobs) > 1 else pictures[id(part)][0],
+                tuple(glints[id(part)]),
+                part.rows,
             )
-            for k in range(0, len(shots), count)
+            for part in parts
         )
         return RawFrame(
-            job=job, exposed=exposed, blur=blur, mirrored=mirrored, labels=labels, failed=failed,
+            job=job, exposed=exposed, blur=blur, mirrored=mirrored, labels=_by_rows(labels, rows), failed=failed,
             lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around(),
         )  # fmt: skip
 
@@ -149,6 +152,27 @@ class Renderer:
         lit: whether to compute light, not only geometry.
         """
         return self._builder.set(job, lit=lit)
+
+
+def _shots_of_a_row(parts: Sequence[SubFrames]) -> int:
+    """Return how many pictures the samples of a row are divided among, at most."""
+    counts = [len(part.jobs) * (np.ones(1) if part.rows is None else part.rows > 0) for part in parts]
+    return max(1, int(np.max(np.asarray(sum(counts)))))
+
+
+def _is_middle(shot: RenderJob, job: RenderJob) -> bool:
+    """Return whether a sub-frame shows the eye, its lids and the camera where the job at mid-exposure has them."""
+    return all(getattr(shot, name) is getattr(job, name) for name in ("M", "t", "camera", "region", "eye"))
+
+
+def _by_rows(labels: PartLabels | None, rows: Sequence[tuple[Bools, PartLabels]]) -> PartLabels | None:
+    """Put raster labels together whose rows are exposed at different times."""
+    if labels is None or not rows:
+        return labels
+    part, amodal = np.array(labels.part), np.array(labels.amodal)
+    for inside, own in rows:
+        part[inside], amodal[inside] = own.part[inside], own.amodal[inside]
+    return replace(labels, part=frozen(part, part.dtype), amodal=frozen(amodal, amodal.dtype))
 
 
 def _marks(

@@ -46,6 +46,7 @@ from .distortion import (
 from .mirror import Mirror as Mirror
 from .mirror import MirrorPlate
 from .opencv import read_opencv
+from .timing import DEFAULT_RATE_HZ, Rolling, Shutter, Timing
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
@@ -81,6 +82,7 @@ def serves(eyes: Sequence[str] | None, side: str) -> bool:
 
 
 _PLACE = {"position_mm", "look_at_mm", "pan_deg", "tilt_deg"}
+_TIMES = ("frame_rate_hz", "phase_ms", "clock_ppm", "shutter")
 _LENS = {"focal_length_px", "focal_length_mm", "sensor_mm", "principal_point_px"}
 # The columns are the camera's right, down and forward axes at rest, in the world (x to the screen, y left, z up).
 _REST = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -178,6 +180,20 @@ class Camera(Spec):
     flip: Literal["horizontal"] | None = Field(
         default=None, description="turns the stored picture left to right, after everything else"
     )
+    frame_rate_hz: Annotated[float, Field(ge=0.01, le=1e5)] | None = Field(
+        default=None, description="frames per second, with a `sequence`; default: 60"
+    )
+    phase_ms: Annotated[float, Field(ge=0, le=1e6)] | None = Field(
+        default=None, description="start of the first frame's exposure, with a `sequence`; default: 0"
+    )
+    clock_ppm: Annotated[float, Field(ge=-1e4, le=1e4)] | None = Field(
+        default=None, description="how much faster its clock runs than the true one, parts per million; default: 0"
+    )
+    shutter: Shutter | None = Field(
+        default=None,
+        description="`global`: all rows are exposed at once; or `{rolling: {row_us: R}}`: one after the other, visible "
+        "with a `sequence`; default: global",
+    )
 
     @classmethod
     def from_opencv(
@@ -233,7 +249,7 @@ class Camera(Spec):
         else:
             R, t = found.R, found.t * self.calibration.unit_mm
         numbers = {"K": found.K, "R": R, "t_mm": t, "distortion": distortion_data(found.distortion)}
-        names = ("name", "resolution_px", "mirror", "eyes", "flip", "relative_illumination")
+        names = ("name", "resolution_px", "mirror", "eyes", "flip", "relative_illumination", *_TIMES)
         kept = {name: getattr(self, name) for name in names}
         return type(self).from_mapping({**kept, "calibration": numbers}, source=str(path))
 
@@ -302,6 +318,19 @@ class Camera(Spec):
         camera = replace(self.unmirrored(), eyes=self.eyes, relative_illumination=table)
         camera = camera if self.mirror is None else camera.seen_in(self.mirror)
         return camera if self.flip is None else camera.flipped()
+
+    def timing(self, exposure_s: float, pulses_s: Floats) -> Timing:
+        """Return the times of its frames; `pulses_s` (m, 2) are the start and end of each light's pulse in a frame."""
+        rolling = self.shutter.rolling.row_us * 1e-6 if isinstance(self.shutter, Rolling) else 0.0
+        rate = (self.frame_rate_hz or DEFAULT_RATE_HZ) * (1.0 + (self.clock_ppm or 0.0) * 1e-6)
+        return Timing(
+            period_s=1.0 / rate,
+            phase_s=(self.phase_ms or 0.0) * 1e-3,
+            exposure_s=exposure_s,
+            row_s=rolling,
+            rows=self.resolution_px[1],
+            pulses_s=pulses_s,
+        )
 
     def unmirrored(self) -> PinholeCamera:
         """Build the numeric camera at its real position, without the mirror."""

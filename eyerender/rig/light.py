@@ -5,6 +5,7 @@ Radiant intensity in direction w: I(w) = I0 max(0, cos(angle to the axis))^m (m 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
@@ -16,6 +17,7 @@ from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.spec import EYES, NonNegative, Number, Positive, Side, Spec, Vec3
 from .camera import EyeNames, PinholeCamera, serves
 from .mirror import Mirror
+from .timing import ALWAYS_S, Pulse
 
 # Largest number of LEDs of a rig, including each LED of a ring: each has a glint with a status and a reason in every
 # frame.
@@ -84,7 +86,10 @@ class Led(Spec):
     duty_cycle: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None,
         description="share of the time in which it is on, for eye safety alone; pictures expose while it is on; "
-        "default: 1",
+        "default: that of its pulses, else 1",
+    )
+    pulse: Pulse | None = Field(
+        default=None, description="when it is on in each frame of the cameras, with a `sequence`; default: always"
     )
 
     @model_validator(mode="after")
@@ -109,8 +114,12 @@ class Led(Spec):
         nearest: Floats = _EYES_MM[0 if right < left else 1]
         return nearest
 
-    def build(self, cameras: tuple[PinholeCamera, ...]) -> tuple[Lamp, ...]:
-        """Build the numeric lights of this entry."""
+    def pulsed_share(self, rates_hz: Sequence[float]) -> float:
+        """Return the share of the time in which its pulses are on, for the rates of the cameras that start them."""
+        return 1.0 if self.pulse is None or not rates_hz else min(sum(rates_hz) * self.pulse.width_ms * 1e-3, 1.0)
+
+    def build(self, cameras: tuple[PinholeCamera, ...], rates_hz: Sequence[float] = ()) -> tuple[Lamp, ...]:
+        """Build the numeric lights of this entry; `rates_hz` are those of the cameras that start its pulses."""
         if self.position_mm is not None:
             places = [np.array(self.position_mm, dtype=float)]
         else:
@@ -134,8 +143,9 @@ class Led(Spec):
                 intensity_mw_sr=share * self.intensity_mw_sr,
                 lobe_exponent=self.lobe_exponent,
                 inner_radius_mm=self.inner_radius_mm,
-                duty_cycle=1.0 if self.duty_cycle is None else self.duty_cycle,
+                duty_cycle=self.pulsed_share(rates_hz) if self.duty_cycle is None else self.duty_cycle,
                 eyes=self.eyes,
+                pulse_s=ALWAYS_S if self.pulse is None else self.pulse.span_s,
             )
             for p, aim in zip(places, aims, strict=True)
         )
@@ -153,6 +163,7 @@ class Lamp(ArrayValue):
         lobe_exponent: m of cos^m.
         inner_radius_mm: radius of the hole of a ring-shaped emitter.
         duty_cycle: share of the time in which it is on; used for eye safety only.
+        pulse_s: start and end of its pulse after the start of a frame, s; -inf and inf if it is always on.
         eyes: eyes that it lights; None: both. Eye safety counts its light for both eyes all the same.
     """
 
@@ -164,6 +175,7 @@ class Lamp(ArrayValue):
     inner_radius_mm: float = 0.0
     duty_cycle: float = 1.0
     eyes: tuple[Side, ...] | None = None
+    pulse_s: tuple[float, float] = ALWAYS_S
 
     def lights(self, eye: int) -> bool:
         """Return whether the LED lights an eye: 0 right, 1 left, -1 unknown (then yes)."""

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from ..base.arrays import ArrayValue, Body, Bools, Ints
 from ..base.errors import InputError
-from ..base.spec import KeyProblem, Side, Spec
+from ..base.spec import EYES, KeyProblem, Side, Spec
 from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import IpdAdjustment, Mount
@@ -71,6 +71,8 @@ class Rig(Spec):
                 raise ValueError(f"lights.{i}.ring.camera: there is no camera {light.ring.camera}")
         if self.obstacles and any(camera.mirror is not None for camera in self.cameras):
             raise ValueError("obstacles: cannot be given with a camera that looks past a mirror")
+        for i, light in enumerate(self.lights):
+            _check_pulse(light, self._rates_hz(light), f"lights.{i}")
         if self.light_count > MAX_LIGHTS:
             raise ValueError(f"lights: are {self.light_count} with those of the rings; at most {MAX_LIGHTS}")
         return self
@@ -79,6 +81,13 @@ class Rig(Spec):
     def light_count(self) -> int:
         """Number of lights, counting each LED of a ring."""
         return sum(1 if light.ring is None else light.ring.count for light in self.lights)
+
+    def _rates_hz(self, light: Led) -> tuple[float, ...]:
+        """Return the rates of the cameras whose frames start a light's pulses; cameras in step count once."""
+        sides = [side for side in EYES if serves(light.eyes, side)]
+        seeing = [camera for camera in self.cameras if any(serves(camera.eyes, side) for side in sides)]
+        clocks = {(camera.frame_rate_hz, camera.phase_ms or 0.0, camera.clock_ppm or 0.0) for camera in seeing}
+        return tuple(rate for rate, _, _ in clocks if rate is not None)
 
     def with_light(self, number: int, **changes: Any) -> Self:
         """Change one light of the rig.
@@ -207,7 +216,7 @@ class Rig(Spec):
         cameras = tuple(camera.build() for camera in self.cameras)
         # A ring of LEDs surrounds the real camera, not its mirror image.
         places = tuple(camera.unmirrored() for camera in self.cameras)
-        lights = tuple(light for spec in self.lights for light in spec.build(places))
+        lights = tuple(light for spec in self.lights for light in spec.build(places, self._rates_hz(spec)))
         if self.ipd_adjust is not None:
             cameras = tuple(self.ipd_adjust.camera(camera, ipd_mm) for camera in cameras)
             lights = tuple(self.ipd_adjust.lamp(light, ipd_mm) for light in lights)
@@ -285,6 +294,17 @@ class RigGeometry(ArrayValue):
                 "up": screen.up.tolist(),
             },
         }
+
+
+def _check_pulse(light: Led, rates_hz: tuple[float, ...], path: str) -> None:
+    """Refuse a pulse that does not fit into a frame, or that contradicts the duty cycle."""
+    if light.pulse is None or not rates_hz:
+        return
+    end_s, share = light.pulse.span_s[1], light.pulsed_share(rates_hz)
+    if end_s > (1.0 + 1e-9) / max(rates_hz):
+        raise KeyProblem(f"{path}.pulse", f"ends after {1e3 * end_s:g} ms, but a frame takes {1e3 / max(rates_hz):g} ms")
+    if light.duty_cycle is not None and abs(light.duty_cycle - share) > 0.01 * share:
+        raise KeyProblem(f"{path}.duty_cycle", f"is {light.duty_cycle:g}, but the pulses and frame rates make {share:g}")
 
 
 def _listed(eyes: tuple[Side, ...] | None) -> list[Side] | None:

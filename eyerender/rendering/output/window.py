@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import ArrayValue, Bools, Singles, frozen, sealed
+from ...base.arrays import ArrayValue, Bools, Floats, Singles, frozen, sealed
 from ...base.errors import InputError
 from ...rig import defocus, exposure, psf, stray
 from ...rig.camera import PinholeCamera, Window
@@ -87,10 +87,12 @@ class Exposed(ArrayValue):
     Attributes:
         picture: mean radiance of the pixels, with the border that the lens needs, or its parts.
         glints: light of the lamps' mirror images.
+        rows: (height,) share of the exposure of each row; None: all of it.
     """
 
     picture: Singles
     glints: tuple[Shine, ...]
+    rows: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -99,7 +101,7 @@ class RawFrame(ArrayValue):
 
     Attributes:
         job: the frame's job.
-        exposed: the light of the frame; for an interlaced camera that of even rows, and that of odd rows.
+        exposed: the light of the frame, in parts of the exposure if its rows differ.
         blur: defocus of the job.
         mirrored: positions and energies of the glints.
         labels: raster labels, if they or geometry were requested.
@@ -129,11 +131,7 @@ class RawFrame(ArrayValue):
             InputError: numbers so extreme that the image is not finite.
         """
         job, labels, mirrored, highlights = self.job, self.labels, self.mirrored, self.highlights
-        irradiance, reflections = self._irradiance(self.exposed[0])
-        if len(self.exposed) == 2:
-            odd = 1 - job.window[1] % 2
-            for both, second in zip((irradiance, reflections), self._irradiance(self.exposed[1]), strict=True):
-                both[odd::2] = second[odd::2]
+        irradiance, reflections = self._of_rows()
         irradiance = sealed(irradiance)
         if not np.all(np.isfinite(irradiance)):
             raise InputError("the numbers of the scene are too extreme: its image is not finite")
@@ -163,6 +161,25 @@ class RawFrame(ArrayValue):
             lens_reflections=frozen(reflections, np.bool_) if job.eye.worn else None,
         )
         return done.flipped(job.camera) if job.flip else done
+
+    def _of_rows(self) -> tuple[Singles, Bools]:
+        """Add up the parts of the exposure: irradiance (height, width) W/m^2, and lens reflections.
+
+        Reflections are those of the part that a row gets most of.
+        """
+        if len(self.exposed) == 1 and self.exposed[0].rows is None:
+            return self._irradiance(self.exposed[0])
+        height = self.job.window[3]
+        shares = np.stack([np.ones(height) if e.rows is None else e.rows for e in self.exposed]).astype(np.float32)
+        total = np.zeros((height, self.job.window[2]), np.float32)
+        reflections = np.zeros(total.shape, np.bool_)
+        for k, exposed in enumerate(self.exposed):
+            if shares[k].any():
+                light, mirrored = self._irradiance(exposed)
+                total += shares[k][:, None] * light
+                most = shares.argmax(axis=0) == k
+                reflections[most] = mirrored[most]
+        return total, reflections
 
     def _irradiance(self, exposed: Exposed) -> tuple[Singles, Bools]:
         """Compute the irradiance (height, width) of the window, W/m^2, in one exposure, and its lens reflections."""

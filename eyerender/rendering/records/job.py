@@ -272,6 +272,21 @@ def _lens_parameters(lens: WornLens) -> LensParameters:
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SubFrames(ArrayValue):
+    """Moments of an exposure that share its rows.
+
+    Attributes:
+        jobs: the jobs, whose pictures have equal weights.
+        rows: (height,) share of the whole exposure of each row of the window; None: all of it.
+        labelled: (height,) rows whose raster labels the first job gives; None: none.
+    """
+
+    jobs: tuple[RenderJob, ...]
+    rows: Floats | None = None
+    labelled: Bools | None = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Still:
     """Parameters that depend on the eye only; surfaces have no tear film."""
