@@ -7,7 +7,7 @@ chunks whose arrays stay in the cache, so memory beyond the result is bounded.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ import numpy.typing as npt
 from ..base.arrays import ArrayValue, Bools, Floats, Statuses
 from ..base.errors import InputError
 from ..base.status import Status, mark
-from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes
-from ..eye.model import EyeModel
+from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes, take_stops
+from ..eye.model import EyeModel, Stop
 from ..eye.pose import Poses, rigid_motion
 from ..eye.worn import WornLens
 from ..optics.ellipse import fit_ellipse_direct
@@ -28,6 +28,9 @@ from ..scene.observation import MAX_BOUNDARY_POINTS, MAX_POINTS
 from .occluders import Occluders
 from .rays import glint_exits, lit_points, pupil_exits
 from .view_kernels import project_all, see_all
+
+RigidMotions = tuple[Floats, Floats]
+"""Rotations (n, 3, 3) and translations (n, 3) mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -98,6 +101,8 @@ def features(
     boundary_points: int = 30,
     purkinje: Sequence[int] = (1,),
     occluders: Occluders | None = None,
+    stops: Stop | None = None,
+    rig_motion: RigidMotions | None = None,
 ) -> Features:
     """Compute the features of n eyes.
 
@@ -114,6 +119,8 @@ def features(
         purkinje: orders of the requested images of each light; one that an eye lacks has status MISSED.
         occluders: what hides features besides the eye itself. Light that enters the eye is followed from its lamp to
             the point where it leaves.
+        stops: n stops in place of those of the eyes.
+        rig_motion: n rotations and translations x' = R x + t that move cameras, lights and occluders in the world.
     """
     _check_options(len(np.atleast_1d(eye_index)), boundary_points, purkinje)
     which = np.asarray(eye_index, dtype=np.intp)
@@ -133,7 +140,10 @@ def features(
             camera = cameras[number]
             for block, turned in chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
                 pose = Poses(poses.azimuth_rad[block], poses.elevation_rad[block], poses.torsion_rad[block])
-                view = View.of(turned, pose, position[block], camera)
+                moved = None if rig_motion is None else (rig_motion[0][block], rig_motion[1][block])
+                view = View.of(turned, pose, position[block], camera, moved)
+                if stops is not None:
+                    turned = replace(turned, stop=take_stops(stops, block))
                 some = np.flatnonzero(lit[block].any(axis=0))
                 for j, order in enumerate(purkinje if len(some) else ()):
                     exits, residual, status = glint_exits(
@@ -149,6 +159,8 @@ def features(
                     glint_residual[at, lamp, j], glint_in_image[at, lamp, j] = residual, camera.in_image(pixels)
                 for inner in slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
                     part, eye, near = block[inner], take_eyes(turned, np.arange(len(block))[inner]), view.rows(inner)
+                    if stops is not None:
+                        eye = replace(eye, stop=take_stops(stops, part))
                     # The last point is the stop's centre.
                     exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm, near.lenses)
                     pixels, status = near.project(exits, status)
@@ -218,10 +230,23 @@ class View:
     lenses: tuple[WornLens, ...]
 
     @classmethod
-    def of(cls, eye: EyeModel, poses: Poses, position_mm: Floats, camera: PinholeCamera) -> View:
-        """Create the view of a camera on posed eyes whose unrotated apexes are at positions (n, 3) in the world."""
-        turn, shift = rigid_motion(poses, eye)
-        whole = shift + position_mm
+    def of(
+        cls,
+        eye: EyeModel,
+        poses: Poses,
+        position_mm: Floats,
+        camera: PinholeCamera,
+        rig_motion: RigidMotions | None = None,
+    ) -> View:
+        """Create the view of a camera on posed eyes whose unrotated apexes are at positions (n, 3) in the world.
+
+        If the rig moves, everything is seen from it: what is called the world is then the frame of the rig.
+        """
+        own, shift = rigid_motion(poses, eye)
+        turn, whole = own, shift + position_mm
+        if rig_motion is not None:
+            back, offset = rig_motion
+            turn, whole = np.einsum("nji,njk->nik", back, own), np.einsum("nji,nj->ni", back, whole - offset)
         rotation, translation, at = np.empty(turn.shape), np.empty(shift.shape), np.empty(shift.shape[::-1])
         see_all(turn, whole, np.array(camera.R), np.array(camera.t), rotation, translation, at)
         return cls(
@@ -230,7 +255,7 @@ class View:
             camera_mm=(at[0], at[1], at[2]),
             motion=(turn, whole),
             camera=camera,
-            lenses=tuple(lens.turned(turn, shift) for lens in eye.worn),
+            lenses=tuple(lens.turned(own, shift) for lens in eye.worn),
         )
 
     def rows(self, part: slice) -> View:

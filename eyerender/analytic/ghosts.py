@@ -14,14 +14,19 @@ from ..eye.pose import Poses
 from ..optics.surfaces import Xyz
 from ..rig.rig import RigGeometry
 from ..scene.observation import GlintFeatures, Index, PoseTruth
-from .features import View
+from .features import RigidMotions, View
 from .rays import glint_exits
 
 _STEPS = 8  # each reduces the error by the ratio of the glass's thickness to the distance, a tenth at most
 
 
 def ghost_glint_features(
-    rig: RigGeometry, eyes: Sequence[EyeModel], which: Indices, index: Index, pose: PoseTruth
+    rig: RigGeometry,
+    eyes: Sequence[EyeModel],
+    which: Indices,
+    index: Index,
+    pose: PoseTruth,
+    rig_motion: RigidMotions | None = None,
 ) -> GlintFeatures | None:
     """Compute the ghost of each glint, for cameras whose mirror has one; None if no mirror has."""
     numbers = [k for k, camera in enumerate(rig.cameras) if camera.mirror is not None and camera.mirror.has_ghosts]
@@ -37,7 +42,8 @@ def ghost_glint_features(
             own = rows[index.camera[rows] == number]
             for block, eye in chunks(group, own, CHUNK_POINTS // 4) if len(own) else ():
                 turn = Poses(pose.azimuth_rad[block], pose.elevation_rad[block], pose.torsion_rad[block])
-                view = View.of(eye, turn, place[block], camera)
+                moved = None if rig_motion is None else (rig_motion[0][block], rig_motion[1][block])
+                view = View.of(eye, turn, place[block], camera, moved)
                 for k in range(m):
                     xy[block, k], status[block, k] = _seen(view, eye, lights[k : k + 1])
                 inside[block] = camera.in_image(xy[block])

@@ -13,11 +13,12 @@ from ..base.arrays import Bools, Floats, Indices
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.legs import LensImage, lens_images
-from ..eye.model import EyeModel
+from ..eye.model import EyeModel, Stop
 from ..eye.pose import Poses
 from ..optics.ellipse import fit_ellipse_direct
 from ..rig.imaging import Opening
 from ..rig.rig import RigGeometry, RigLike
+from ..rig.timing import Timing
 from ..scene.observation import (
     EYES,
     SURFACES,
@@ -28,7 +29,8 @@ from ..scene.observation import (
     PoseTruth,
     PupilFeatures,
 )
-from .features import Features, features
+from .exposed import at_own_times
+from .features import Features, RigidMotions, features
 from .ghosts import ghost_glint_features
 from .occluders import Occluders
 
@@ -55,8 +57,25 @@ class TraceableScene(Protocol):
         """Openings through which the cameras look."""
         ...
 
+    @property
+    def timings(self) -> tuple[Timing, ...]:
+        """When each camera takes its frames."""
+        ...
+
     def eyes_of(self, index: Index) -> tuple[list[EyeModel], Indices]:
         """Build the numeric eyes of an index, and return which of them each row uses."""
+        ...
+
+    def stops_of(self, index: Index) -> Stop | None:
+        """Return the stop of each row where a sequence changes it; None if it does not."""
+        ...
+
+    def rig_motions(self, index: Index) -> RigidMotions | None:
+        """Return how a sequence moves the rig in each row; None if it does not."""
+        ...
+
+    def rig_at(self, index: Index, row: int) -> RigGeometry:
+        """Return the rig in the world as it stands in one row."""
         ...
 
 
@@ -81,6 +100,10 @@ class Traceable(Protocol):
 
     def seen_by(self, rig: RigLike | None) -> Self:
         """Observe the same eyes with another rig."""
+        ...
+
+    def at(self, rows: Any, time_s: Floats) -> Traceable:
+        """Select rows of a sequence and return their eyes at other times, s."""
         ...
 
 
@@ -140,7 +163,27 @@ class AnalyticObserver:
                 f"must be among {', '.join(map(str, has))}: {scene.eye_name} has no other Purkinje images",
                 path="purkinje",
             )
-        seen = features(
+        seen = self._traced(frames, purkinje)
+        pupil_s, glint_s = None, None
+        if len(index) and np.isfinite(index.start_s).all():
+            seen, pupil_s, glint_s = at_own_times(
+                seen, index, scene.rig, scene.timings, lambda rows, at: self._traced(frames.at(rows, at), purkinje)
+            )
+        observed = Observations(
+            index=index,
+            pose=pose,
+            pupil=replace(pupil_features(seen), time_s=pupil_s),
+            glints=replace(glint_features(seen), time_s=glint_s),
+            lens_glints=lens_glint_features(scene, eyes, which, index),
+            ghost_glints=ghost_glint_features(scene.rig, eyes, which, index, pose, scene.rig_motions(index)),
+        )
+        return observed, seen
+
+    def _traced(self, frames: Traceable, purkinje: Sequence[int]) -> Features:
+        """Compute the features of rows at the times of their frames."""
+        scene, index, pose = frames.scene, frames.index, frames.pose
+        eyes, which = scene.eyes_of(index)
+        return features(
             eyes,
             which,
             Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad),
@@ -152,16 +195,9 @@ class AnalyticObserver:
             boundary_points=self.boundary_points,
             purkinje=(1, *sorted(set(purkinje) - {1})),
             occluders=Occluders.of(scene.rig, scene.openings) if self.occluded else None,
+            stops=scene.stops_of(index),
+            rig_motion=scene.rig_motions(index),
         )
-        observed = Observations(
-            index=index,
-            pose=pose,
-            pupil=pupil_features(seen),
-            glints=glint_features(seen),
-            lens_glints=lens_glint_features(scene.rig, eyes, which, index),
-            ghost_glints=ghost_glint_features(scene.rig, eyes, which, index, pose),
-        )
-        return observed, seen
 
 
 def trace(
@@ -298,7 +334,7 @@ def glint_features(seen: Features) -> GlintFeatures:
 
 
 def lens_glint_features(
-    rig: RigGeometry, eyes: Sequence[EyeModel], which: Indices, index: Index
+    scene: TraceableScene, eyes: Sequence[EyeModel], which: Indices, index: Index
 ) -> LensGlintFeatures | None:
     """Compute the reflections of lamps in the lenses worn; None if nobody wears any.
 
@@ -307,11 +343,14 @@ def lens_glint_features(
     if not any(eye.worn for eye in eyes):
         return None
     places = index.eye_position_mm + index.head_mm
+    moved = np.nan_to_num(np.concatenate([index.rig_rotation_rad, index.rig_translation_mm], axis=1))
     keys, rows, back = np.unique(
-        np.column_stack([index.camera, which, places]), axis=0, return_index=True, return_inverse=True
+        np.column_stack([index.camera, which, places, moved]), axis=0, return_index=True, return_inverse=True
     )
+    rigs = [scene.rig_at(index, int(row)) for row in rows]
     found = [
-        _images_of(rig, eyes[which[row]], int(index.eye[row]), int(index.camera[row]), places[row]) for row in rows
+        _images_of(rig, eyes[which[row]], int(index.eye[row]), int(index.camera[row]), places[row])
+        for rig, row in zip(rigs, rows, strict=True)
     ]
     shape = len(keys), max(map(len, found))
     status, light = np.full(shape, Status.NONE, np.int8), np.full(shape, -1)
@@ -319,7 +358,7 @@ def lens_glint_features(
     xy, inside = np.full((*shape, 2), np.nan), np.zeros(shape, dtype=bool)
     reason = np.full(shape, None, dtype=object)
     for k, (row, images) in enumerate(zip(rows, found, strict=True)):
-        camera = rig.cameras[index.camera[row]]
+        camera = rigs[k].cameras[index.camera[row]]
         for j, one in enumerate(images):
             xy[k, j], front = camera.project(one.seen_mm + places[row])
             at = Status.BEHIND_CAMERA if one.status == Status.OK and not front else one.status

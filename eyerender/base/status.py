@@ -36,6 +36,7 @@ class Status(IntEnum):
     BEHIND_OBSTACLE = 18
     BEHIND_OPENING = 19
     BESIDE_MIRROR = 20
+    UNLIT = 21
     # Fixations.
     TARGET_TOO_NEAR = 9
     OUT_OF_REACH = 10
@@ -83,6 +84,7 @@ _REASONS = {
     Status.BEHIND_OBSTACLE: "occluded by obstacle",
     Status.BEHIND_OPENING: "occluded by frame",
     Status.BESIDE_MIRROR: "beside the mirror",
+    Status.UNLIT: "no light while its rows are exposed",
     Status.TARGET_TOO_NEAR: "the target lies inside the eye",
     Status.OUT_OF_REACH: "the target is out of reach of the eye's rotation",
     Status.NO_LINE_OF_SIGHT: "no line of sight joins the target and the fovea",

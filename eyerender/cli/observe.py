@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from ..base.errors import InputError, InputWarning
 from ..base.processes import usable_cpus
 from ..base.status import Status
+from ..imaging.tracker import Tracker
 from ..scene.observation import EYES, MAX_BOUNDARY_POINTS, Observations
 from .app import app
 from .options import AtLeastOne, EyeModel, Result, SceneName, Strict
@@ -21,6 +22,7 @@ from .output import Heed, emit, progress
 if TYPE_CHECKING:
     from ..extraction.region import SearchRegion
     from ..extraction.settings import ExtractionSettings
+    from ..scene import Scene
 
 
 @app.command(name="features")
@@ -31,6 +33,10 @@ def features(
     eye: EyeModel = None,
     points: int = 30,
     purkinje: Annotated[tuple[int, ...] | None, Parameter(consume_multiple=True)] = None,
+    tracker: Annotated[Tracker, Parameter(name="*")] = Tracker(),
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    format: Literal["csv", "asc"] = "csv",
+    screen_px: tuple[int, int] = (1920, 1080),
     strict: Strict = False,
     json: Result = None,
 ) -> int:
@@ -41,6 +47,9 @@ def features(
     Args:
         points: Number of boundary points of the pupil.
         purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
+        output: With --rate: the file of the trace.
+        format: With --rate: a table (csv), or EyeLink's text form (asc).
+        screen_px: With --format asc: width and height of the screen in pixels.
     """
     # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver, purkinje_records
@@ -52,8 +61,13 @@ def features(
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
     if purkinje == ():
         raise InputError("needs numbers of Purkinje images, 1 to 4", source="--purkinje")
+    if (output is None) != (tracker.rate == 0.0):
+        missing = ("--output", "with --rate") if output is None else ("--rate", "with --output")
+        raise InputError(f"is needed {missing[1]}", source=missing[0])
     heed = Heed(strict)
     loaded = heed.scene(scene, eye=eye)
+    if output is not None:
+        return _sampled(loaded, tracker, output, format, screen_px)
     frames = loaded.frames()
     observed, seen = AnalyticObserver(points).observe_in_detail(frames, purkinje=purkinje or (1,))
     data: dict[str, Any] = {
@@ -66,6 +80,25 @@ def features(
         data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
         data["non_ellipticity_px"] = [float(v) if np.isfinite(v) else None for v in seen.ellipse_residual_px]
     emit(data, _feature_table(observed), json, heed)
+    return 0
+
+
+def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px: tuple[int, int]) -> int:
+    """Write the trace of a sequence, and beside a table its schema."""
+    from ..base.storage.files import csv_text, refuse_special, write_json, write_text
+    from ..imaging.asc import asc_text
+    from ..imaging.trace import sample_sequence
+
+    refuse_special(output)
+    if min(screen_px) < 1 or max(screen_px) > 65536:
+        raise InputError("must be 1 to 65536", source="--screen-px")
+    trace = sample_sequence(scene, tracker)
+    if form == "asc":
+        write_text(output, asc_text(trace, screen_px))
+    else:
+        write_text(output, csv_text(trace.header(), trace.rows()))
+        write_json(output.with_name(output.name + ".json"), trace.to_mapping())
+    print(f"{output}: {len(trace.observations)} samples, {tracker.rate:g} per second")
     return 0
 
 

@@ -268,5 +268,6 @@ def sample_line(
         },
         tree={**sample.scene, "sensor": {**sample.scene.get("sensor", {}), **exposed}},
         eye=sample.eye or None,
+        timestamp_s=float(observations.index.timestamp_s[row]),
     )
     return image_name(turn.sample, frame, frames, side), line

@@ -52,6 +52,19 @@ def take_eyes(eye: EyeModel, index: Indices) -> EyeModel:
     return replace(eye, **{name: _taken(getattr(eye, name), index) for name in _NUMBERS})
 
 
+def take_stops(stops: Stop, index: Indices) -> Stop:
+    """Select stops of a batch by `index`."""
+    found: Stop = _taken(stops, index)
+    return found
+
+
+def stack_stops(stops: Sequence[Stop]) -> Stop:
+    """Stack n stops into a batch."""
+    waves = max(stop.contour.shape[-1] for stop in stops)
+    found: Stop = _stacked(tuple(_with_waves(stop, waves) for stop in stops))
+    return found
+
+
 def _stacked(values: tuple[Any, ...]) -> Any:
     """Stack one part of n eyes: arrays or numbers, tuples, records of arrays, surfaces or media."""
     first = values[0]

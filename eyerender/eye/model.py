@@ -54,6 +54,12 @@ class Stop(ArrayValue):
         """Largest distance of the margin from the centre, within 0.1 %; of a single stop."""
         return float(np.max(np.linalg.norm(self.boundary(360) - self.centre_mm, axis=-1)))
 
+    def mirrored(self) -> Stop:
+        """Mirror the stop to the other side: every point (x, y, z) -> (x, -y, z)."""
+        return replace(
+            self, centre_mm=flip_y(self.centre_mm), rotation=mirror_rotation(self.rotation), handed=-self.handed
+        )
+
     def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
         """Compute the relative radius r at the parameter f of the ellipse.
 
@@ -223,9 +229,7 @@ class EyeModel(ArrayValue):
             front=tuple(s.mirrored() for s in self.front),
             back=tuple(s.mirrored() for s in self.back),
             retina=self.retina.mirrored(),
-            stop=replace(
-                stop, centre_mm=flip_y(stop.centre_mm), rotation=mirror_rotation(stop.rotation), handed=-stop.handed
-            ),
+            stop=stop.mirrored(),
             sclera=replace(self.sclera, centre_mm=flipped(self.sclera.centre_mm)),
             rotation=RotationCentres(
                 flipped(centres.azimuth_centre_mm),

@@ -16,12 +16,14 @@ from ..base.errors import InputError
 from ..base.progress import COMPILING, Progress, followed_by, one_behind
 from ..eye.legs import apparent_places
 from ..eye.model import EyeModel
-from ..eye.pose import Poses, rigid_motion
 from ..eye.refraction import at_cornea_d
 from ..folders.imagefile import MAX_PIXELS, compressed
+from ..region.anatomy import Region
 from ..rig.camera import Window
+from ..rig.rig import RigGeometry
 from ..rig.stray import misses_light
 from ..scene.observation import EYES
+from .moments import eye_motion, moments, rest_mm
 from .renderable import RenderableFrames, RenderableScene, RenderableSource, posed_frames
 
 if TYPE_CHECKING:
@@ -79,7 +81,7 @@ class EyeImage:
     @property
     def apex_mm(self) -> Floats:
         """Apex of the unrotated eye in the world, (3,) mm."""
-        return np.asarray(self.frame.index.eye_position_mm[0] + self.frame.index.head_mm[0])
+        return rest_mm(self.frame, 0)
 
     @property
     def scene(self) -> RenderableScene:
@@ -90,6 +92,16 @@ class EyeImage:
     def camera(self) -> int:
         """Index of the camera."""
         return int(self.frame.index.camera[0])
+
+    @property
+    def rig(self) -> RigGeometry:
+        """Rig in the world, as it stands in this frame."""
+        return self.scene.rig_at(self.frame.index, 0)
+
+    @property
+    def region(self) -> Region | None:
+        """Region of the eye, with its lids as they are in this frame."""
+        return self.scene.region_at(self.frame.index, 0)
 
 
 def render_windows(
@@ -205,7 +217,7 @@ def _steps(many: Iterable[RenderableFrames], wanted: dict[str, Any]) -> Iterator
         check_windows(frames.scene)
         for row in range(len(frames)):
             job = replace(render_job(frames, row), **wanted)
-            yield _Step(frames, row, job, moments(frames, row, job))
+            yield _Step(frames, row, job, moments(frames, row, job, render_job))
 
 
 def render_job(frames: RenderableFrames, row: int) -> RenderJob:
@@ -222,12 +234,13 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
     seeds = np.random.SeedSequence(
         [scene.spec.seed, int(index.instant[row]), int(index.eye[row]), *([rank] if rank else [])]
     )
-    lights = tuple(scene.rig.lights[k] for k in scene.rig.lights_of(int(index.eye[row])))
+    rig = scene.rig_at(index, row)
+    lights = tuple(rig.lights[k] for k in rig.lights_of(int(index.eye[row])))
     if not lights:
         raise InputError(f"none lights the {side} eye; name it in `eyes` of one", path="rig.lights")
-    view, window = scene.rig.cameras[camera], scene.window(camera, head, int(index.eye[row]))
+    view, window = rig.cameras[camera], scene.window(camera, head, int(index.eye[row]))
     return RenderJob(
-        eye=scene.eye(side, tuple(index.head_mm[row])),
+        eye=scene.eye_at(index, row),
         M=M,
         t=t,
         camera=view.unflipped,
@@ -236,16 +249,16 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         lights=lights,
         sensor=scene.spec.sensor,
         look=scene.spec.look,
-        region=None if scene.region is None else scene.region.of_side(side),
+        region=scene.region_at(index, row),
         lens=scene.spec.lens,
         ambient=scene.ambient,
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
         interreflection=scene.spec.image.interreflection,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=int(seeds.generate_state(1, np.uint64)[0]),
-        apex_mm=index.eye_position_mm[row] + index.head_mm[row],
+        apex_mm=rest_mm(frames, row),
         focus_dpt=focus_dpt(frames, row),
-        obstacles=scene.rig.bodies(),
+        obstacles=rig.bodies(),
     )
 
 
@@ -269,36 +282,6 @@ def focus_dpt(frames: RenderableFrames, row: int) -> float:
         gap = apparent_places(eye.worn, gap[None])[0]
     target = 1e3 / float(np.linalg.norm(gap)) if np.isfinite(gap).all() else 0.0
     return max(target, far)
-
-
-def moments(frames: RenderableFrames, row: int, middle: RenderJob) -> tuple[SubFrames, ...]:
-    """Return the job at evenly spaced moments of the exposure, with moving eye and head; empty if nothing moves.
-
-    An interlaced camera has one exposure for its even rows, and a second one for its odd rows.
-    """
-    from ..rendering.records.job import SubFrames
-
-    scene, pose = frames.scene, frames.pose
-    motion, sensor = scene.spec.motion, scene.spec.sensor
-    if motion is None:
-        return ()
-    during = ((np.arange(motion.steps) + 0.5) / motion.steps - 0.5) * sensor.time_ms * 1e-3
-    delay = sensor.field_delay_ms * 1e-3
-    out = []
-    for k, time_s in enumerate(np.concatenate([during - delay / 2, during + delay / 2]) if delay else during):
-        azimuth = pose.azimuth_rad[row] + np.radians(motion.eye_deg_s[0]) * time_s
-        elevation = pose.elevation_rad[row] + np.radians(motion.eye_deg_s[1]) * time_s
-        M, t = rigid_motion(Poses.listing([azimuth], [elevation]), middle.eye)
-        apex = middle.anchor_mm + np.array(motion.head_mm_s) * time_s
-        seed = int(np.random.SeedSequence([middle.seed, k]).generate_state(1, np.uint64)[0])
-        # The middle moment is the job itself, so the renderer need not set it up again.
-        moved = {"M": M[0], "t": t[0] + apex, "apex_mm": apex} if time_s else {}
-        out.append(replace(middle, **moved, seed=seed, labels=False))
-    if not delay:
-        return (SubFrames(jobs=tuple(out)),)
-    odd = (np.arange(middle.window[3]) + middle.window[1]) % 2.0
-    first, second = tuple(out[: motion.steps]), tuple(out[motion.steps :])
-    return SubFrames(jobs=first, rows=1.0 - odd), SubFrames(jobs=second, rows=odd)
 
 
 def check_windows(scene: RenderableScene) -> None:
@@ -353,7 +336,7 @@ def noiseless(image: EyeImage) -> NDArray[Any]:
 
     spec = image.scene.spec
     sensor = spec.sensor.model_copy(update={"noise": False})
-    camera = image.scene.rig.cameras[image.camera]
+    camera = image.rig.cameras[image.camera]
     dn = recorded(sensor, camera, image.window, image.irradiance.astype(float), spec.wavelength_nm, 0)
     return dn.astype(np.uint8) if sensor.bit_depth == 8 else dn
 
@@ -365,12 +348,3 @@ def stored(scene: RenderableScene, dn: NDArray[np.uint16]) -> NDArray[Any]:
         return dn
     codes = dn.astype(np.uint8)
     return codes if sensor.jpeg_quality is None else compressed(codes, sensor.jpeg_quality)
-
-
-def eye_motion(frames: RenderableFrames, row: int) -> tuple[Floats, Floats]:
-    """Compute the rigid motion x_world = M x + t of the eye of one row: M (3, 3), t (3,) mm."""
-    index, pose = frames.index, frames.pose
-    one = slice(row, row + 1)
-    poses = Poses(pose.azimuth_rad[one], pose.elevation_rad[one], pose.torsion_rad[one])
-    M, t = rigid_motion(poses, frames.scene.eye(EYES[index.eye[row]]))
-    return M[0], t[0] + (index.eye_position_mm[row] + index.head_mm[row])

@@ -63,7 +63,9 @@ def render_folder(
         for kind in ("images", "masks", *(["lens_reflections"] if worn else [])):
             (folder / kind).mkdir()
         for image in render_windows(frames, backend=backend, threads=threads, progress=progress):
-            line = image_line(scene, records[image.row], image.window, image_labels(image, truth))
+            stored_s = float(truth.index.timestamp_s[image.row])
+            labels = image_labels(image, truth)
+            line = image_line(scene, records[image.row], image.window, labels, timestamp_s=stored_s)
             line |= {"file_name": f"images/{image.name}.png", "mask_file_name": f"masks/{image.name}.png"}
             writer.put(folder / line["file_name"], image.counts)
             writer.put(folder / line["mask_file_name"], image.parts)

@@ -23,14 +23,16 @@ from ..eye.fixation import fixations
 from ..eye.model import EyeModel
 from ..optics.ellipse import fit_ellipse_direct
 from ..optics.transforms import rotated
+from ..region.anatomy import Region
 from ..region.limbus import lower
 from ..region.mesh import lid_margins
 from ..rendering.records.job import globe_of
 from ..rig.camera import PinholeCamera, Window, in_window
-from ..scene.observation import EYES, Observations
+from ..rig.rig import RigGeometry
+from ..scene.observation import EYES, Index, Observations
 from ..scene.parts import IRIS, PUPIL
 from ..scene.viewer import past_lenses
-from .capture import EyeImage, eye_motion
+from .capture import EyeImage, eye_motion, rest_mm
 from .renderable import RenderableFrames, RenderableScene
 
 RIM_HIDDEN = "the cornea hides a part of its rim"
@@ -42,7 +44,7 @@ _FAR_MM = 1e9  # a distant observer: the entrance pupil looks larger than from i
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeInWindow:
-    """An eye in a window, without the image: row `row` of frames, its `camera` and `window`.
+    """An eye in a window, without the image: row `row` of frames, its `camera`, `window`, `rig` and `region`.
 
     The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame is placed in the world by x_world = M x
     + t; the apex of the unrotated eye is at apex_mm.
@@ -55,6 +57,8 @@ class EyeInWindow:
     M: Floats
     t: Floats
     apex_mm: Floats
+    rig: RigGeometry
+    region: Region | None
 
     @classmethod
     def of(cls, frames: RenderableFrames, row: int) -> EyeInWindow:
@@ -62,9 +66,17 @@ class EyeInWindow:
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
-        eye = scene.eye(EYES[side], tuple(index.head_mm[row]))
-        apex = index.eye_position_mm[row] + index.head_mm[row]
-        return cls(row=row, camera=camera, window=scene.window(camera, head, side), eye=eye, M=M, t=t, apex_mm=apex)
+        return cls(
+            row=row,
+            camera=camera,
+            window=scene.window(camera, head, side),
+            eye=scene.eye_at(index, row),
+            M=M,
+            t=t,
+            apex_mm=rest_mm(frames, row),
+            rig=scene.rig_at(index, row),
+            region=scene.region_at(index, row),
+        )
 
 
 def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
@@ -105,13 +117,13 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
 
 def known_labels(scene: RenderableScene, observations: Observations, view: EyeInWindow | EyeImage) -> dict[str, Any]:
     """Compute the labels that follow from pose and parameters, without an image: a part of `image_labels`."""
-    camera = scene.rig.cameras[view.camera]
+    camera = view.rig.cameras[view.camera]
     return {
         "eye_present": eye_present(camera, view),
         "pupil": {
             "amodal": _ellipse_of_record(observations, view.row),
             "entrance_diameter_mm": entrance_diameter_mm(view.eye),
-            "stop_diameter_mm": scene.stop_diameter_mm(EYES[int(observations.index.eye[view.row])]),
+            "stop_diameter_mm": stop_diameter_mm(scene, observations.index, view.row),
         },
         "iris": {"amodal": iris_outline(scene, view)},
         "glints": _glints(scene, observations, view),
@@ -120,8 +132,14 @@ def known_labels(scene: RenderableScene, observations: Observations, view: EyeIn
         "globe_radius_mm": float(view.eye.sclera.radius_mm),
         "pose": {"rotation": view.M.tolist(), "translation_mm": view.t.tolist()},
         "camera": camera.to_mapping("t_mm"),
-        "lights_mm": [light.position_mm.tolist() for light in scene.rig.lights],
+        "lights_mm": [light.position_mm.tolist() for light in view.rig.lights],
     }
+
+
+def stop_diameter_mm(scene: RenderableScene, index: Index, row: int) -> float:
+    """Return the diameter (mm) of the stop of one row."""
+    moved = float(index.stop_mm[row])
+    return moved if np.isfinite(moved) else scene.stop_diameter_mm(EYES[int(index.eye[row])])
 
 
 def eye_present(camera: PinholeCamera, view: EyeInWindow | EyeImage) -> bool:
@@ -144,7 +162,7 @@ def lid_opening(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[st
     It is None for a bare eye and for a head mesh. At rest, the person's own lids neither shut nor squint nor are wide,
     and follow the same gaze.
     """
-    region, person = scene.spec.region, scene.spec.person
+    region, person = view.region, scene.spec.person
     if region is None or region.head is not None:
         return None
     rest = region.with_lids()
@@ -152,8 +170,7 @@ def lid_opening(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[st
         rest = rest.model_copy(update={"fissure": person.region().fissure})
     globe = globe_of(view.eye, view.M, view.t - view.apex_mm)
     y = float((rotated(view.M, view.eye.stop.centre_mm) + view.t - view.apex_mm)[1])
-    side = view.eye.side
-    now, before = (lid_margins(spec.of_side(side), globe).opening_mm(globe, y) for spec in (region, rest))
+    now, before = (lid_margins(spec, globe).opening_mm(globe, y) for spec in (region, rest))
     return {"mm": now, "share": now / before if before > 0 else None}
 
 
@@ -271,7 +288,7 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
         The projected curve, with the points that the cornea hides, and the reason why it is not visible as a whole
         (None if it is).
     """
-    surface, camera = view.eye.front[0], scene.rig.cameras[view.camera]
+    surface, camera = view.eye.front[0], view.rig.cameras[view.camera]
     rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
     angle = 2 * np.pi * np.arange(count) / count
     y, z = lower(surface, rho * np.cos(angle), rho * np.sin(angle), scene.spec.look.limbus_aspect)
@@ -408,9 +425,9 @@ def space_labels(frames: RenderableFrames, observations: Observations) -> list[d
         view = EyeInWindow.of(frames, row)
         diameters = {
             "entrance_diameter_mm": entrance_diameter_mm(view.eye),
-            "stop_diameter_mm": scene.stop_diameter_mm(EYES[int(observations.index.eye[row])]),
+            "stop_diameter_mm": stop_diameter_mm(scene, observations.index, row),
         }
-        out.append(_space(scene, observations, view, scene.rig.cameras[view.camera]) | diameters)
+        out.append(_space(scene, observations, view, view.rig.cameras[view.camera]) | diameters)
     return out
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
+from ..base.arrays import finite_or_none
 from ..eye.spectacles import lenses_of
 from ..folders.imagefolder import FILE_KEYS, IMAGE_SCHEMA
 from ..rig.camera import Window
@@ -26,6 +28,7 @@ def image_line(
     drawn: Mapping[str, Any] | None = None,
     tree: Mapping[str, Any] | None = None,
     eye: Mapping[str, Any] | None = None,
+    timestamp_s: float = math.nan,
 ) -> dict[str, Any]:
     """Return the line of an image; the keys of files are null.
 
@@ -38,6 +41,7 @@ def image_line(
         drawn: values of `DRAWN_KEYS`, in a dataset.
         tree: keys of the scene; default: all.
         eye: keys of the eye file; default: those of the scene's eye.
+        timestamp_s: time that the camera stored; NaN if it stored none.
     """
     tree = scene.spec.to_mapping() if tree is None else tree
     eye = scene.eye_file(record["eye"]).to_mapping() if eye is None else eye
@@ -48,7 +52,7 @@ def image_line(
         **dict.fromkeys(SAMPLE_KEYS),
         **(sample or {}),
         **{key: record[key] for key in ("subject", "instant", "time_s", "rig_pose")},
-        "timestamp_s": None,
+        "timestamp_s": finite_or_none(timestamp_s),
         "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
         "bit_depth": spec.sensor.bit_depth,
         "gamma": spec.sensor.gamma,
@@ -56,7 +60,7 @@ def image_line(
         "labels": labels,
         "parameters": {
             "eye_model": scene.eye_name,
-            "pupil_diameter_mm": scene.stop_diameter_mm(record["eye"]),
+            "pupil_diameter_mm": labels["pupil"]["stop_diameter_mm"],
             "wavelength_nm": spec.wavelength_nm,
             "spp": spec.image.spp,
             "seed": spec.seed,

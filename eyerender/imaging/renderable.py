@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol, Self, runtime_checkable
 
 from ..analytic.observer import Traceable, TraceableScene
+from ..base.arrays import Floats
 from ..eye.contact import ContactLens
 from ..eye.model import EyeModel
 from ..population.people import Person
@@ -13,6 +14,7 @@ from ..region.look import Look
 from ..rig.camera import Window
 from ..rig.imaging import Ambient, Lens, Motion, Picture
 from ..rig.sensor import Sensor
+from ..scene.observation import Index
 
 
 class EyeSettings(Protocol):
@@ -63,6 +65,11 @@ class PictureSettings(Protocol):
         ...
 
     @property
+    def sequence(self) -> object | None:
+        """Eyes, lids, head and rig in time."""
+        ...
+
+    @property
     def motion(self) -> Motion | None:
         """Motion during the exposure."""
         ...
@@ -107,6 +114,18 @@ class RenderableScene(TraceableScene, Protocol):
 
     def eye(self, side: str, head_mm: tuple[float, ...] | None = None) -> EyeModel:
         """Return the numeric eye of a side, with the lenses worn at a position of the head."""
+        ...
+
+    def eye_position_mm(self, side: str) -> Floats:
+        """Return the apex of an unrotated eye, (3,) mm."""
+        ...
+
+    def eye_at(self, index: Index, row: int) -> EyeModel:
+        """Return the numeric eye of one row, with the pupil as it is then."""
+        ...
+
+    def region_at(self, index: Index, row: int) -> Region | None:
+        """Return the region of the eye of one row, with its lids as they are then; None for a bare eye."""
         ...
 
     def contact_lens(self, side: str) -> ContactLens | None:

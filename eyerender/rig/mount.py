@@ -2,17 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..base.arrays import Body, Floats, frozen
+from ..base.arrays import ArrayValue, Body, Floats, frozen
 from ..base.spec import EYES, NonNegative, Positive, Side, Spec, Vec3
 from ..optics.transforms import rotated
 from .camera import PinholeCamera
 from .light import Lamp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidMotion(ArrayValue):
+    """A rigid motion x' = R x + t in the world: rotation (3, 3) and translation (3,) mm."""
+
+    rotation: Floats
+    translation_mm: Floats
+
+    def camera(self, camera: PinholeCamera) -> PinholeCamera:
+        """Move a camera, so that a moved world point has the same camera coordinates as before."""
+        turned = camera.R @ self.rotation.T
+        return replace(camera, R=frozen(turned), t=frozen(camera.t - rotated(turned, self.translation_mm)))
+
+    def lamp(self, lamp: Lamp) -> Lamp:
+        """Move a light and turn its axis."""
+        return replace(
+            lamp,
+            position_mm=frozen(rotated(self.rotation, lamp.position_mm) + self.translation_mm),
+            axis=frozen(rotated(self.rotation, lamp.axis)),
+        )
+
+    def body(self, body: Body) -> Body:
+        """Move an obstacle."""
+        moved = frozen(body.vertices @ self.rotation.T + self.translation_mm)
+        return replace(body, vertices=moved, normals=frozen(body.normals @ self.rotation.T))
 
 
 class Mount(Spec):
@@ -38,24 +64,15 @@ class Mount(Spec):
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
         """Move a camera, so that a moved world point has the same camera coordinates as before."""
-        rotation, offset = self.motion()
-        turned = camera.R @ rotation.T
-        return replace(camera, R=frozen(turned), t=frozen(camera.t - rotated(turned, offset)))
+        return RigidMotion(*self.motion()).camera(camera)
 
     def lamp(self, lamp: Lamp) -> Lamp:
         """Move a light and turn its axis."""
-        rotation, offset = self.motion()
-        return replace(
-            lamp,
-            position_mm=frozen(rotated(rotation, lamp.position_mm) + offset),
-            axis=frozen(rotated(rotation, lamp.axis)),
-        )
+        return RigidMotion(*self.motion()).lamp(lamp)
 
     def body(self, body: Body) -> Body:
         """Move an obstacle."""
-        rotation, offset = self.motion()
-        moved = frozen(body.vertices @ rotation.T + offset)
-        return replace(body, vertices=moved, normals=frozen(body.normals @ rotation.T))
+        return RigidMotion(*self.motion()).body(body)
 
 
 class IpdAdjustment(Spec):

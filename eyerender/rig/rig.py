@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Protocol, Self
 
@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from ..base.arrays import ArrayValue, Body, Bools, Ints
+from ..base.arrays import ArrayValue, Body, Bools, Floats, Ints
 from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Side, Spec
 from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
-from .mount import IpdAdjustment, Mount
+from .mount import IpdAdjustment, Mount, RigidMotion
 from .obstacles import Obstacle
 from .screen import Screen, ScreenPlane
 from .unit import UnitCalibration
@@ -250,6 +250,13 @@ class RigGeometry(ArrayValue):
     screen: ScreenPlane | None
     obstacles: tuple[Obstacle, ...] = ()
     mount: Mount | None = None
+    moved_by: RigidMotion | None = None
+
+    def moved(self, rotation: Floats, translation_mm: Floats) -> RigGeometry:
+        """Move cameras, lights and obstacles, not the screen: x' = R x + t in the world."""
+        motion = RigidMotion(rotation, translation_mm)
+        cameras, lights = tuple(map(motion.camera, self.cameras)), tuple(map(motion.lamp, self.lights))
+        return replace(self, cameras=cameras, lights=lights, moved_by=motion if self.obstacles else None)
 
     def build(self, ipd_mm: float | None = None) -> RigGeometry:
         """Return this rig, which is already numeric and adjusted."""
@@ -264,7 +271,8 @@ class RigGeometry(ArrayValue):
         out = []
         for k, obstacle in enumerate(self.obstacles):
             try:
-                out.append(obstacle.build(self.mount))
+                body = obstacle.build(self.mount)
+                out.append(body if self.moved_by is None else self.moved_by.body(body))
             except InputError as error:
                 raise error.placed(under=f"rig.obstacles.{k}.file") from None
         return tuple(out)

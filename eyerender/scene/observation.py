@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,11 +29,13 @@ RECORD_SCHEMA = "eyerender/record/3"
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
 # Largest number of glints of all observations of a batch; each has a status and a reason.
 MAX_GLINTS = 5_000_000
-# Keys of a record that no scene fills yet: motion of rig and eye, further reflections.
-_UNUSED = ("rig_pose", "events", "blink_phase")
+# Keys of a record that no scene fills yet: further reflections.
 _UNUSED_FEATURES = ("purkinje",)
 # Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
+
+EVENTS = ("fixation", "microsaccade", "saccade", "oscillation", "pursuit", "blink")
+"""What an eye may do at a time, as `events` of records name it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -54,7 +55,16 @@ class Index(Columns):
         target_mm: (n, 3) NaN where there is no target.
         head_mm: (n, 3) head position.
         eye_position_mm: (n, 3) apex of the unrotated eye in the world, without `head_mm`.
-        time_s: time of mid-exposure.
+        time_s: time of mid-exposure, or of the middle of the LEDs' light in it.
+        start_s: start of the exposure of the first row, in a sequence.
+        timestamp_s: time that the camera stored.
+        rig_rotation_rad: (n, 3) rotation vector of the rig: x' = R x + t about the world's origin, its mount included.
+        rig_translation_mm: (n, 3) t of it.
+        stop_mm: diameter of the stop; NaN is the scene's own.
+        stop_shift_mm: (n, 2) displacement of the stop along y and z in the eye's frame.
+        lids: (n, 3) `blink`, `squint` and `wide` of the lids; NaN are the scene's own.
+        events: what the eye does, words joined by +, of `EVENTS`; None is unknown.
+        blink_phase: closing, closed or opening; None in no blink.
     """
 
     frame: Ints
@@ -69,6 +79,15 @@ class Index(Columns):
     head_mm: Floats = column(3)
     eye_position_mm: Floats = column(3)
     time_s: Floats = column()
+    start_s: Floats = column()
+    timestamp_s: Floats = column()
+    rig_rotation_rad: Floats = column(3)
+    rig_translation_mm: Floats = column(3)
+    stop_mm: Floats = column()
+    stop_shift_mm: Floats = column(2)
+    lids: Floats = column(3)
+    events: Objects = column()
+    blink_phase: Objects = column()
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -110,6 +129,7 @@ class PupilFeatures(Columns):
             there are fewer than m.
         arc_ellipse: (n, 5) (cx, cy, a, b px, angle rad); NaN where the visible points do not determine it.
         confidence: (n,) probability that the pupil is right, from an extractor; NaN if unknown.
+        time_s: (n,) when the row of its centre is exposed, in a sequence.
     """
 
     status: Statuses
@@ -124,6 +144,7 @@ class PupilFeatures(Columns):
     arcs_deg: Floats = column(0, 2)
     arc_ellipse: Floats = column(5)
     confidence: Floats = column()
+    time_s: Floats = column()
 
     @property
     def ok(self) -> Bools:
@@ -136,7 +157,8 @@ class GlintFeatures(Columns):
     """Glints in full-sensor pixels, arrays with leading axes (n, m); `light` is -1 where it is unknown.
 
     `status` (n, m) are `Status`, with a `reason` in words where it is not OK. A status NONE is no glint at all: rows
-    with fewer than m glints are padded, and a light that does not light the eye has none.
+    with fewer than m glints are padded, and a light that does not light the eye has none. In a sequence, `time_s` says
+    when the row of each is exposed.
     """
 
     LEADING = 2
@@ -147,6 +169,7 @@ class GlintFeatures(Columns):
     in_image: Bools = column()
     xy_px: Floats = column(2)
     covariance: Floats = column(2, 2)
+    time_s: Floats = column()
 
     @property
     def ok(self) -> Bools:
@@ -178,6 +201,17 @@ class LensGlintFeatures(GlintFeatures):
 
 WHITE = math.sqrt(2.0)
 """RMS-S2S over SD of white noise."""
+
+
+def correlated(white: Floats, s2s_over_sd: float) -> Floats:
+    """Make a series of noise with a ratio of RMS-S2S over SD from white noise (n, ...), along the first axis."""
+    from scipy.signal import lfilter  # which takes a fifth of a second to import
+
+    kept = 1.0 - s2s_over_sd**2 / 2.0
+    if not kept:
+        return white
+    steps = np.concatenate([white[:1], np.sqrt(1.0 - kept**2) * white[1:]])
+    return np.asarray(lfilter([1.0], [1.0, -kept], steps, axis=0))
 
 
 class PixelNoise(Protocol):
@@ -253,11 +287,9 @@ class Observations(ArrayValue):
         series = np.unique(np.stack([self.index.eye, self.index.camera]), axis=1, return_inverse=True)[1].reshape(-1)
         rng = np.random.default_rng(seed)
         unit = np.concatenate([rng.standard_normal((len(self), k, 2)) for k in (1, glints.light.shape[1])], axis=1)
-        kept = 1.0 - s2s_over_sd**2 / 2.0
-        for one in np.unique(series) if kept else ():
+        for one in np.unique(series):
             rows = np.flatnonzero(series == one)
-            for before, row in pairwise(rows.tolist()):
-                unit[row] = kept * unit[before] + np.sqrt(1.0 - kept**2) * unit[row]
+            unit[rows] = correlated(unit[rows], s2s_over_sd)
         moves = size[..., None] * unit
         wider = (size**2)[..., None, None] * np.eye(2)
         covariance = np.array(pupil.covariance)
@@ -313,7 +345,9 @@ class Observations(ArrayValue):
                 "torsion_deg": _numbers(np.degrees(pose.torsion_rad[i])),
                 "residual_mm": _numbers(pose.residual_mm[i]),
             },
-            **dict.fromkeys(_UNUSED),
+            "rig_pose": _rig_pose(at, i),
+            "events": None if at.events[i] is None else [word for word in at.events[i].split("+") if word],
+            "blink_phase": at.blink_phase[i],
             "pupil": {
                 "status": status.label,
                 "reason": pupil.reason[i] or None,
@@ -326,7 +360,7 @@ class Observations(ArrayValue):
                 "covariance": _numbers(pupil.covariance[i]),
                 "arcs_deg": _points(pupil.arcs_deg[i]),
                 "arc_ellipse": _arc_ellipse(pupil.arc_ellipse[i]),
-                "time_s": None,
+                "time_s": _numbers(pupil.time_s[i]),
             },
             "glints": _glint_records(self.glints, i),
             "lens_glints": None if lens_glints is None else _glint_records(lens_glints, i) or None,
@@ -384,6 +418,9 @@ class Observations(ArrayValue):
                 target_mm=reader.array("target_mm", (3,)),
                 head_mm=head,
                 eye_position_mm=reader.array("eye_position_mm", (3,)),
+                events=reader.events(),
+                blink_phase=reader.texts("blink_phase"),
+                **reader.rig_poses(),
             ),
             pose=PoseTruth(
                 azimuth_rad=np.radians(reader.array("pose.azimuth_deg", ())),
@@ -404,12 +441,13 @@ class Observations(ArrayValue):
                 arcs_deg=reader.points("pupil.arcs_deg", "arcs [from, to]"),
                 arc_ellipse=reader.arc_ellipses(),
                 confidence=reader.array("confidence", (), optional=True),
+                time_s=reader.array("pupil.time_s", ()),
             ),
             glints=GlintFeatures(**reader.glints("glints")),
             lens_glints=reader.lens_glints(),
             ghost_glints=reader.ghost_glints(),
         )
-        for key in (*_UNUSED, *_UNUSED_FEATURES, "pupil.time_s"):
+        for key in _UNUSED_FEATURES:
             reader.values(key)
         reader.problems.check()
         return found
@@ -546,6 +584,28 @@ class _Reader:
                 self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
         return frozen(out)
 
+    def events(self) -> Objects:
+        """Read lists of events as words joined by +."""
+        out = np.full(len(self.records), None, dtype=object)
+        for k, value in enumerate(self.values("events")):
+            if isinstance(value, list) and set(map(str, value)) <= set(EVENTS) and len(value) <= len(EVENTS):
+                out[k] = "+".join(value)
+            elif value is not None:
+                self.refuse(k, "events", f"must be null or a list of {', '.join(EVENTS)}")
+        return out
+
+    def rig_poses(self) -> dict[str, Floats]:
+        """Read the poses of the rig, NaN where there is none."""
+        out = {name: np.full((len(self.records), 3), np.nan) for name in ("rotation_rad", "translation_mm")}
+        for k, value in enumerate(self.values("rig_pose")):
+            for name, column_ in out.items() if value is not None else ():
+                found = _array(value.get(name)) if isinstance(value, dict) else None
+                if found is None or found.shape != (3,):
+                    self.refuse(k, "rig_pose", "must be null or have rotation_rad and translation_mm, 3 numbers each")
+                    break
+                column_[k] = found
+        return {f"rig_{name}": values for name, values in out.items()}
+
     def ghost_glints(self) -> GlintFeatures | None:
         if all(entries is None for entries in self.values("ghost_glints")):
             return None
@@ -577,6 +637,7 @@ class _Reader:
         light, status = np.full((n, m), -1, np.int64), np.full((n, m), Status.NONE, np.int8)
         reason = np.full((n, m), None, object)
         inside, xy, covariance = np.zeros((n, m), bool), np.full((n, m, 2), np.nan), np.full((n, m, 2, 2), np.nan)
+        time_s = np.full((n, m), np.nan)
         for k, entries in enumerate(rows):
             for j, g in enumerate(entries):
                 if not self.complete and isinstance(g, dict):
@@ -594,9 +655,11 @@ class _Reader:
                     xy[k, j] = g["xy_px"]
                 if g["covariance"] is not None:
                     covariance[k, j] = g["covariance"]
+                if g["time_s"] is not None:
+                    time_s[k, j] = g["time_s"]
         return {
             "light": light, "status": status, "reason": reason,
-            "in_image": inside, "xy_px": xy, "covariance": covariance,
+            "in_image": inside, "xy_px": xy, "covariance": covariance, "time_s": time_s,
         }  # fmt: skip
 
 
@@ -614,11 +677,16 @@ def _glint_records(glints: GlintFeatures, i: int) -> list[dict[str, Any]]:
             "in_image": bool(glints.in_image[i, j]) if status[j] == Status.OK else None,
             "xy_px": _numbers(glints.xy_px[i, j]),
             "covariance": _numbers(glints.covariance[i, j]),
-            "time_s": None,
+            "time_s": _numbers(glints.time_s[i, j]),
         }
         for j in range(len(status))
         if status[j] != Status.NONE
     ]
+
+
+def _rig_pose(at: Index, i: int) -> dict[str, Any] | None:
+    turn, shift = _numbers(at.rig_rotation_rad[i]), _numbers(at.rig_translation_mm[i])
+    return None if turn is None or shift is None else {"rotation_rad": turn, "translation_mm": shift}
 
 
 def _arc_ellipse(values: Floats) -> dict[str, Any] | None:
@@ -647,9 +715,9 @@ def _glint_problem(g: Any) -> str | None:
     ):
         if not fits:
             return message
-    for key, shape in (("xy_px", (2,)), ("covariance", (2, 2))):
+    for key, shape in (("xy_px", (2,)), ("covariance", (2, 2)), ("time_s", ())):
         if g[key] is not None and ((found := _array(g[key])) is None or found.shape != shape):
-            return f"{key} must be null or {'x'.join(map(str, shape))} numbers"
+            return f"{key} must be null or {'x'.join(map(str, shape)) or 'one'} number(s)"
     if g["status"] == "ok" and g["xy_px"] is None:
         return "it is 'ok', but has no xy_px"
     return None

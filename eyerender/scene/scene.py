@@ -27,7 +27,7 @@ from ..base.status import Status
 from ..eye.contact import ContactLens, contact_lens_of
 from ..eye.fixation import fixations
 from ..eye.margin import PupilMargin
-from ..eye.model import EyeModel
+from ..eye.model import EyeModel, Stop
 from ..eye.pose import listing_torsion
 from ..eye.spec import EyeSpec
 from ..eye.spectacles import SpectacleLens, demand_through_d, lenses_of
@@ -35,7 +35,7 @@ from ..population.eyes import amplitude_d
 from ..population.people import Person, PopulationSpec
 from ..population.response import REFERENCE_AGE, responding
 from ..population.table import default_table
-from ..region.anatomy import Region
+from ..region.anatomy import MOVEMENTS, Region
 from ..region.face import face_depth
 from ..rig.camera import PinholeCamera, Window
 from ..rig.exposure import automatic_exposure, iris_radiance
@@ -52,8 +52,11 @@ from ..rig.plausibility import (
 )
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..rig.sensor import Sensor
+from ..rig.timing import Timing
 from .observation import EYES, Index, PoseTruth
+from .sequence.habits import Habits
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
+from .timeline import at_other_times, instants_of, rig_motions, rows_at, rows_in_time, single_stop, stops_of
 
 # Parts worn on a face may press the skin a little. Farther than 45 mm from an eye, the face is only a guess.
 _BELOW_SKIN_MM, _FACE_MM = 2.0, 45.0
@@ -98,6 +101,10 @@ class Frames(ArrayValue):
     def take(self, rows: Any) -> Frames:
         """Select rows (indices, a slice or a mask)."""
         return Frames(self.scene, self.index.take(rows), self.pose.take(rows))
+
+    def at(self, rows: Any, time_s: Floats) -> Frames:
+        """Select rows of a sequence and return their eyes at other times, s."""
+        return Frames(self.scene, *at_other_times(self.scene, self.index.take(rows), time_s))
 
     def seen_by(self, rig: RigLike | None) -> Self:
         """Observe the same eyes with another rig that has as many cameras; None changes nothing.
@@ -168,7 +175,7 @@ class Scene:
             subject: the subject, with the eye model.
             rig: cameras, lights and screen.
             name: name of the scene in reports.
-            fields: the other fields of `SceneSpec`: `targets` or `poses`, `region`, `look`, `sensor`, `lens`,
+            fields: the other fields of `SceneSpec`: `targets`, `poses` or `sequence`, `region`, `look`, `sensor`, `lens`,
                 `ambient`, `motion`, `image`, `wavelength_nm`, `seed`, `description`.
 
         Raises:
@@ -288,7 +295,7 @@ class Scene:
             data = _without_person(data)
         data |= fields
         if gaze_deg is not None or target_mm is not None:
-            data["targets"] = data["poses"] = None
+            data["targets"] = data["poses"] = data["sequence"] = None
         if gaze_deg is not None:
             data["poses"] = EyeDirection.listed(gaze_deg)
         if target_mm is not None:
@@ -511,9 +518,7 @@ class Scene:
 
         `head_mm` is the head's displacement, which lenses on the rig do not follow; default: the first one.
         """
-        eye, same = self.spec.eye, _Same(self.eye_file(side))
-        if self.spec.person is None and (state := _state_of(self.spec, self.rig)) is not None:
-            same = _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
+        eye, same = self.spec.eye, self._responding(side)
         built = _built_eye(same, side == "left", self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
         contact, lenses = self.contact_lens(side), lenses_of(self.spec.subject.spectacles, side)
         on_rig = any(lens.mount == "rig" for lens in lenses)
@@ -521,6 +526,18 @@ class Scene:
         if contact is None and not lenses:
             return built
         return _wearing(_Same(built), contact, lenses, tuple(head) if on_rig else None)
+
+    def _responding(self, side: str) -> _Same[EyeSpec]:
+        """Return the eye file of one side, adapted to the light and the viewing distance of the scene."""
+        eye, same = self.spec.eye, _Same(self.eye_file(side))
+        if self.spec.person is None and (state := _state_of(self.spec, self.rig)) is not None:
+            return _responded(same, state, self.spec.wavelength_nm, eye.pupil_diameter_mm, eye.margin)
+        return same
+
+    def responding_file(self, side: str) -> EyeSpec:
+        """Return the eye file that the numeric eye of one side is built from, written as a right eye."""
+        spec, margin = self._responding(side).spec, self.spec.eye.margin
+        return spec if margin is None else margin.applied(spec)
 
     def contact_lens(self, side: str) -> ContactLens | None:
         """Return the contact lens on one eye."""
@@ -605,6 +622,8 @@ class Scene:
     @property
     def frame_count(self) -> int:
         """How many frames there are, one for each head position, fixation and camera, whether it sees an eye or not."""
+        if (sequence := self.spec.sequence) is not None:
+            return len(self.rig.cameras) * (instants_of(self) if sequence.instants is None else len(sequence.instants))
         fixations = len(self.spec.poses or ()) if self.targets_mm is None else len(self.targets_mm)
         return len(self.spec.subject.head_positions_mm) * fixations * len(self.rig.cameras)
 
@@ -614,6 +633,8 @@ class Scene:
         Raises:
             InputError: no pose of an eye fixates a target; the message names the target and the reason.
         """
+        if self.spec.sequence is not None:
+            return Frames(self, *rows_in_time(self))
         index = self.index()
         if self.spec.poses is None:
             return Frames(self, index, self._fixating(index))
@@ -626,6 +647,61 @@ class Scene:
             residual_mm=np.zeros(len(index)),
         )
         return Frames(self, index, pose)
+
+    def frames_at(self, time_s: ArrayLike) -> Frames:
+        """Return the rows of a sequence at any times (k,), s, whatever the rates of the cameras are.
+
+        Raises:
+            InputError: the scene has no sequence.
+        """
+        if self.spec.sequence is None:
+            raise InputError("is missing; only a sequence has times", source=self.source, path="sequence")
+        return Frames(self, *rows_at(self, time_s))
+
+    @property
+    def habits(self) -> Habits:
+        """Habits of the person's eyes in time."""
+        return Habits()
+
+    @property
+    def sequence_targets_mm(self) -> Floats | None:
+        """World points that a sequence names."""
+        return None
+
+    @property
+    def timings(self) -> tuple[Timing, ...]:
+        """When each camera takes its frames."""
+        pulses = np.array([light.pulse_s for light in self.rig.lights], dtype=float).reshape(-1, 2)
+        exposure_s = self.spec.sensor.time_ms * 1e-3
+        return tuple(camera.timing(exposure_s, pulses) for camera in self.spec.rig.cameras)
+
+    def rig_motions(self, index: Index) -> tuple[Floats, Floats] | None:
+        """Return how a sequence moves the rig in each row: R (n, 3, 3) and t (n, 3) of x' = R x + t; None if not."""
+        return rig_motions(self, index)
+
+    def rig_at(self, index: Index, row: int) -> RigGeometry:
+        """Return the rig in the world as it stands in one row."""
+        motions = self.rig_motions(index.take([row]))
+        return self.rig if motions is None else self.rig.moved(motions[0][0], motions[1][0])
+
+    def region_at(self, index: Index, row: int) -> Region | None:
+        """Return the eye region of the eye of one row, with its lids as they are then."""
+        region, lids = self.region, index.lids[row]
+        if region is None or region.head is not None:
+            return region
+        if np.isfinite(lids).all():
+            region = region.model_copy(update=dict(zip(MOVEMENTS, lids.tolist(), strict=True)))
+        return region.of_side(EYES[index.eye[row]])
+
+    def stops_of(self, index: Index) -> Stop | None:
+        """Return the stop of each row where a sequence changes it; None if it does not."""
+        return stops_of(self, index)
+
+    def eye_at(self, index: Index, row: int) -> EyeModel:
+        """Build the numeric eye of one row, with the pupil as it is then."""
+        eye = self.eye(EYES[index.eye[row]], tuple(index.head_mm[row]))
+        stops = self.stops_of(index.take([row]))
+        return eye if stops is None else _with_stop(_Same(eye), single_stop(stops, 0))
 
     def _fixating(self, index: Index) -> PoseTruth:
         # All cameras see the same pose, so each head position, fixation and eye is solved once.
@@ -898,6 +974,12 @@ def _built_eye(
     """Build a numeric eye; cached, because observers, renderer and labels request the same one repeatedly."""
     spec = eye.spec if margin is None else margin.applied(eye.spec)
     return spec.build(eye="left" if left else "right", wavelength_nm=wavelength_nm, pupil_diameter_mm=pupil_diameter_mm)
+
+
+@lru_cache(maxsize=16)
+def _with_stop(eye: _Same[EyeModel], stop: Stop) -> EyeModel:
+    """Replace the stop of a numeric eye; cached, because renderer and labels compare eyes by identity."""
+    return replace(eye.spec, stop=stop)
 
 
 @lru_cache(maxsize=64)

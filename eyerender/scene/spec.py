@@ -35,6 +35,7 @@ from ..rig.imaging import Ambient, Lens, Motion, Picture
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from .observation import MAX_GLINTS
+from .sequence.spec import Sequence
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -273,6 +274,11 @@ class SceneSpec(FileSpec):
     poses: Annotated[tuple[EyeDirection, ...], Field(min_length=1)] | None = Field(
         default=None, description="directions of the optic axes, one frame each; give this or `targets`"
     )
+    sequence: Sequence | None = Field(
+        default=None,
+        description="eyes, lids, pupils, head and rig in time, in place of `targets` and `poses`; each camera takes "
+        "frames at its own rate",
+    )
     wavelength_nm: Annotated[float, Field(ge=350, le=1100)] = Field(
         default=850.0,
         description="wavelength of the lights, at which the eye's refractive indices hold; "
@@ -292,8 +298,10 @@ class SceneSpec(FileSpec):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if (self.targets is None) == (self.poses is None):
-            raise ValueError("give either targets or poses")
+        if sum(given is not None for given in (self.targets, self.poses, self.sequence)) != 1:
+            raise ValueError("give either targets or poses, or a sequence")
+        if self.sequence is not None:
+            self._check_sequence()
         if self.targets is not None and self.targets.world_mm is None and self.rig.screen is None:
             raise ValueError("targets on a screen need rig.screen")
         if self.rig.calibration is None:  # else once its file is read
@@ -304,6 +312,17 @@ class SceneSpec(FileSpec):
                 if any(w > r for w, r in zip(self.image.window_px, camera.resolution_px, strict=True)):
                     raise ValueError(f"image.window_px: is larger than the sensor of rig.cameras.{i}")
         return self
+
+    def _check_sequence(self) -> None:
+        if self.motion is not None:
+            raise KeyProblem("motion", "cannot stand beside a sequence, which moves eyes and head")
+        if len(self.subject.head_positions_mm) > 1:
+            raise KeyProblem("subject.head_positions_mm", "must be one with a sequence, which moves the head")
+        if self.sensor.field_delay_ms:
+            raise KeyProblem("sensor.field_delay_ms", "cannot stand beside a sequence so far")
+        lenses = [lens for side in EYES for lens in lenses_of(self.subject.spectacles, side)]
+        if any(lens.mount == "rig" for lens in lenses):
+            raise KeyProblem("subject.spectacles", "cannot have mount: rig with a sequence so far")
 
     def _check_response(self) -> None:
         subject = self.subject
@@ -351,7 +370,9 @@ class SceneSpec(FileSpec):
 
     def _check_size(self) -> None:
         targets = self.targets
-        if targets is None:
+        if self.sequence is not None:
+            fixations = 1  # its frames are counted when they are made
+        elif targets is None:
             fixations = len(self.poses or ())
         elif targets.grid is not None:
             fixations = targets.grid[0] * targets.grid[1]

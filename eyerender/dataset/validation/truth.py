@@ -210,7 +210,8 @@ class SceneTruth:
             return Again(("the scene has no such image",))
         view = EyeInWindow.of(self.frames, row)
         (own,) = found.take([row]).records()
-        expected = image_line(scene, own, view.window, known_labels(scene, found, view))
+        stored_s = float(found.index.timestamp_s[row])
+        expected = image_line(scene, own, view.window, known_labels(scene, found, view), timestamp_s=stored_s)
         problems = [*_differences(_open(expected), _open(line)), *_spots(scene, view, line)]
         problems += _lids(scene, view, line)
         return Again(tuple(problems), _limbus(scene, view))
@@ -263,10 +264,10 @@ def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
 
 def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
     """Check the spots of the glints: each is the mean of the lamp's image, or lies within it if a part is hidden."""
-    eye, camera = view.eye, scene.rig.cameras[view.camera]
+    eye, camera = view.eye, view.rig.cameras[view.camera]
     lenses = tuple(lens.behind(view.M, view.t - view.apex_mm) for lens in eye.worn)
     mirror = GlintScene.of(eye, film_index(eye, scene.spec.look), view.M, view.t, camera, None, lenses)
-    lights = [scene.rig.lights[k] for k in scene.rig.lights_of(EYES.index(eye.side))]
+    lights = [view.rig.lights[k] for k in view.rig.lights_of(EYES.index(eye.side))]
     images = mirror.images(lights, scene.spec.sensor.psf_sigma_px)
     glints = mirror.glints(lights, images, _all_clear)
     picture = scene.spec.image
@@ -290,10 +291,10 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
 
 def lid_landmarks(scene: Scene, view: EyeInWindow) -> dict[str, list[list[float]]] | None:
     """Compute the landmarks along the lids in px, without an image; None for a bare eye and for a head mesh."""
-    if scene.spec.region is None or scene.spec.region.head is not None:
+    if view.region is None or view.region.head is not None:
         return None
-    margins = lid_margins(scene.spec.region.of_side(view.eye.side), globe_of(view.eye, view.M, view.t - view.apex_mm))
-    camera = past_lenses(scene.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
+    margins = lid_margins(view.region, globe_of(view.eye, view.M, view.t - view.apex_mm))
+    camera = past_lenses(view.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
     return lid_margins_px(margins, camera, view.apex_mm)
 
 
