@@ -29,7 +29,7 @@ from scipy.special import betaincinv, log_ndtr, ndtri, ndtri_exp
 from ..base.errors import InputError
 from ..base.spec import Positive, Spec
 
-Unit = Literal["sample", "subject"]
+Unit = Literal["sample", "clip", "subject"]
 MARK = "draw"
 RUN = 16  # points of a Sobol sequence that are permuted
 # The largest numbers that may be drawn are Cauchy's coefficients of an eye's media; the largest integers are seeds.
@@ -39,7 +39,8 @@ Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 
 class _Draw(Spec):
     per: Unit | None = Field(
-        default=None, description="drawn once per sample or once per subject; default: depends on the path"
+        default=None,
+        description="drawn once per sample, per clip of a sequence, or per subject; default: depends on the path",
     )
 
 

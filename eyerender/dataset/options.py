@@ -72,6 +72,7 @@ class PlanOptions:
     """Subjects, splits, image size and storage that replace those of the spec.
 
     Attributes:
+        clips: Make so many clips, of a dataset of sequences; --count counts their frames.
         subjects: Replace the number of subjects of the dataset.
         splits: Replace the splits, as NAME=SHARE,NAME=SHARE: the shares of the subjects.
         size: Replace the size of the pictures, as WIDTHxHEIGHT in pixels; the cameras are scaled so that they see the
@@ -84,6 +85,7 @@ class PlanOptions:
             webdataset: 8, because loaders of such tars clip 16-bit codes at 255, which makes them white).
     """
 
+    clips: int | None = None
     subjects: int | None = None
     splits: str | None = None
     size: str | None = None
@@ -91,6 +93,22 @@ class PlanOptions:
     shard_size: int | None = None
     spp: int | None = None
     bit_depth: Literal[8, 16] | None = None
+
+    def frames(self, spec: DatasetSpec, count: int | None) -> int | None:
+        """Return how many samples to make, from the number of clips if it is given.
+
+        Raises:
+            InputError: both numbers are given, or clips of a dataset without sequences.
+        """
+        if self.clips is None:
+            return count
+        if count is not None:
+            raise InputError("cannot stand beside --count, the number of their frames", source="--clips")
+        if spec.clip_frames == 1:
+            raise InputError("needs a dataset of sequences", source="--clips")
+        if self.clips < 1:
+            raise InputError(f"must be >= 1, not {self.clips}", source="--clips")
+        return self.clips * spec.clip_frames
 
     def apply(self, spec: DatasetSpec, count: int | None = None) -> DatasetSpec:
         """Return the spec with these changes; `count` is the number of samples to make, by default that of the spec.

@@ -147,6 +147,7 @@ class Plan:
         if seed is not None:
             spec = spec.replaced("--seed", {"seed": seed})
         spec = changes.apply(spec, count)
+        count = changes.frames(spec, count)
         if count is not None:
             spec = spec.first(count)
         if own is not None:
@@ -194,7 +195,8 @@ class Plan:
     @cached_property
     def variable_template(self) -> Template:
         """Template of the variables."""
-        return Template.of({"variables": self.spec.variables or {}}, self.spec.seed, source=self.source)
+        tree = {"variables": self.spec.variables or {}}
+        return Template.of(tree, self.spec.seed, source=self.source, clips=self.spec.clip_frames > 1)
 
     @cached_property
     def _variables(self) -> dict[str, Unit]:
@@ -203,7 +205,7 @@ class Plan:
         names = self.spec.variables or {}
         return {
             name: "sample"
-            if any(_is_at(path, name) and placed.unit == "sample" for path, placed in draws.items())
+            if any(_is_at(path, name) and placed.unit != "subject" for path, placed in draws.items())
             else "subject"
             for name in names
         }
@@ -212,7 +214,12 @@ class Plan:
     def scene_template(self) -> Template:
         """Template of the scene."""
         return Template.of(
-            self.spec.scene, self.spec.seed, source=self.source, prefix="scene", variables=self._variables
+            self.spec.scene,
+            self.spec.seed,
+            source=self.source,
+            prefix="scene",
+            variables=self._variables,
+            clips=self.spec.clip_frames > 1,
         )
 
     @cached_property
@@ -341,6 +348,7 @@ class Plan:
             attempt=attempt,
             subject_attempt=subject_attempt,
             place=spec.selection.place_of(sample),
+            frames=spec.clip_frames,
         )
         own = None if self.scenes is None else self.scenes.at(spec.seed, turn, self.base)
         if own is not None and own.subject is not None:
@@ -352,6 +360,9 @@ class Plan:
         tree.setdefault("name", f"{spec.name} {sample}")
         if "seed" not in tree:
             tree["seed"] = int(unit_number(spec.seed, "seed", "sample", sample, attempt) * 2**53)
+        if isinstance(tree.get("sequence"), dict):
+            seed = int(unit_number(spec.seed, "sequence.seed", "clip", turn.clip, 0) * 2**53)
+            tree["sequence"] = {"seed": seed, **tree["sequence"], "instants": [turn.frame]}
         if isinstance(tree.get("rig"), dict) and (tree["rig"].get("ipd_adjust") or {}).get("residual_mm"):
             tree["rig"] = _adjusted(tree, (spec.seed, turn.subject, _SETTING))
         if spec.tolerances is not None:

@@ -183,7 +183,7 @@ def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, O
     count = scene.frame_count
     if frames is not None and count != frames:
         raise InputError(f"has {count} frames, sample 0 has {frames}")
-    if plan.spec.require == "pupil":
+    if plan.spec.require == "pupil" and scene.spec.sequence is None:
         _require_pupils(scene, found)
     return posed, found
 
@@ -246,9 +246,9 @@ def sample_line(
     assert observations is not None
     turn = sample.turn
     (record,) = observations.take([row]).records()
-    frame, instant, side = record["frame"], record["instant"], record["eye"]
     # Numbers of frames and instants are unique in the whole dataset.
     instants = frames // len(scene.rig.cameras)
+    frame, instant, side = record["frame"] % frames, record["instant"] % instants, record["eye"]
     exposed = scene.spec.sensor.model_dump(include={"exposure_ms", "gain_dn_per_e"}, exclude_none=True)
     record |= {
         "frame": turn.sample * frames + frame,

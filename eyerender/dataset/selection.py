@@ -268,6 +268,88 @@ class Selection:
             yield samples[self.are_made(samples)]
 
 
+@dataclass(frozen=True, slots=True)
+class ClipFrames(Sequence[int]):
+    """The frames of clips in a row: n consecutive samples for each number of `clips`."""
+
+    clips: Sequence[int]
+    n: int
+
+    def __len__(self) -> int:
+        return len(self.clips) * self.n
+
+    @overload
+    def __getitem__(self, at: int) -> int: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[int]: ...
+    def __getitem__(self, at: int | slice) -> int | list[int]:
+        if isinstance(at, slice):
+            return [self[k] for k in range(*at.indices(len(self)))]
+        clip, frame = divmod(range(len(self))[at], self.n)
+        return self.clips[clip] * self.n + frame
+
+
+@dataclass(frozen=True, slots=True)
+class ClipSelection:
+    """A selection of clips with n frames each, in terms of their frames: sample i is frame i mod n of clip i div n."""
+
+    clips: Selection
+    n: int
+
+    @property
+    def spread(self) -> bool:
+        """Whether the first clips of each subject are made in turn."""
+        return self.clips.spread
+
+    @property
+    def subject_count(self) -> int:
+        """Number of subjects with at least one clip."""
+        return self.clips.subject_count
+
+    @property
+    def end(self) -> int:
+        """Upper bound of the sample numbers, exclusive."""
+        return self.clips.end * self.n
+
+    @property
+    def shards(self) -> Sequence[int]:
+        """Numbers of the shards that hold a sample, in order."""
+        return self.clips.shards
+
+    @property
+    def samples(self) -> Sequence[int]:
+        """All selected samples, in order."""
+        return ClipFrames(self.clips.samples, self.n)
+
+    def shard_of(self, sample: int) -> int:
+        """Return the shard of a sample."""
+        return self.clips.shard_of(sample // self.n)
+
+    def subject_of(self, sample: int) -> int:
+        """Return the subject of a sample."""
+        return self.clips.subject_of(sample // self.n)
+
+    def place_of(self, sample: int) -> int:
+        """Return the place of a sample's clip where the first clips of all subjects come first."""
+        return self.clips.place_of(sample // self.n)
+
+    def first_of(self, subject: int) -> int:
+        """Return the first sample of a subject."""
+        return self.clips.first_of(subject) * self.n
+
+    def are_made(self, samples: Ints) -> Bools:
+        """Return whether samples are selected, (n,)."""
+        return self.clips.are_made(samples // self.n)
+
+    def shard_samples(self, shard: int) -> Sequence[int]:
+        """Return the samples of a shard, in order."""
+        return ClipFrames(self.clips.shard_samples(shard), self.n)
+
+    def shard_count(self, shard: int) -> int:
+        """Return the number of samples of a shard."""
+        return self.clips.shard_count(shard) * self.n
+
+
 def in_spread_order(items: Sequence[int]) -> list[int]:
     """Order sorted items so that those at the front lie far apart: by the reversed bits of their indices."""
     bits = max(len(items) - 1, 1).bit_length()

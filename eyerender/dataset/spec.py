@@ -16,11 +16,12 @@ from ..base.errors import InputError
 from ..base.spec import FileSpec, Positive, Spec
 from ..design.tolerances import Tolerance, Tolerances
 from ..population.people import PopulationSpec
+from ..rig.timing import DEFAULT_RATE_HZ
 from ..scene import is_shipped_dataset, refuse_folder, shipped_files
 from ..scene.spec import DATASET_KIND, NOT_A_DATASET
 from .expressions import FUNCTIONS
 from .gathering import extended, with_tables
-from .selection import Selection
+from .selection import ClipSelection, Selection
 
 # Largest number of samples of a run; a Sobol sequence has no more points.
 MAX_COUNT = 10**9
@@ -163,14 +164,20 @@ class DatasetSpec(FileSpec):
     def _divide(self) -> Self:
         """Divide a small plan into enough shards for several workers."""
         if "shard_size" not in self.model_fields_set:
-            size = PACKED_SHARD if self.is_packed else self.shard_size
-            object.__setattr__(self, "shard_size", min(size, -(-self.planned_count // LEAST_SHARDS)))
+            n = self.clip_frames
+            size = min(PACKED_SHARD if self.is_packed else self.shard_size, -(-self.planned_count // LEAST_SHARDS))
+            object.__setattr__(self, "shard_size", -(-size // n) * n)
         return self
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.subjects is not None and self.subjects > self.planned_count:
-            raise ValueError(f"subjects: must be at most {self.planned_count} (count or planned), not {self.subjects}")
+        n = self.clip_frames
+        for name in ("count", "planned", "shard_size"):
+            if (getattr(self, name) or 0) % n:
+                raise ValueError(f"{name}: must be a multiple of {n}, the frames of a clip")
+        if self.subjects is not None and self.subjects > self.planned_count // n:
+            most = self.planned_count // n
+            raise ValueError(f"subjects: must be at most {most} (count or planned), not {self.subjects}")
         if self.population is not None and self.eye_parameters:
             raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
         for name in self.variables or {}:
@@ -221,7 +228,14 @@ class DatasetSpec(FileSpec):
     @property
     def subject_count(self) -> int:
         """Number of subjects of the whole plan."""
-        return self.subjects or self.planned_count
+        return self.subjects or self.planned_count // self.clip_frames
+
+    @property
+    def clip_frames(self) -> int:
+        """Number of samples of a clip: frames of a sequence; 1 without a sequence."""
+        if not isinstance(sequence := self.scene.get("sequence"), Mapping):
+            return 1
+        return _clip_frames(sequence.get("duration_s"), self.scene.get("rig"))
 
     def first(self, count: int) -> Self:
         """Return the spec of `count` samples of the same plan, spread over its subjects, or of its continuation."""
@@ -230,17 +244,18 @@ class DatasetSpec(FileSpec):
         return self.replaced("--count", {**changes, "choice": "spread" if count % planned else None})
 
     @property
-    def selection(self) -> Selection:
+    def selection(self) -> Selection | ClipSelection:
         """Which samples are made, and in which shards."""
-        spread = self.choice == "spread" and self.count % self.planned_count > 0
-        return _selection(
-            count=self.count,
-            planned=self.planned_count,
+        spread, n = self.choice == "spread" and self.count % self.planned_count > 0, self.clip_frames
+        found = _selection(
+            count=self.count // n,
+            planned=self.planned_count // n,
             subjects=self.subject_count,
-            shard_size=self.shard_size,
+            shard_size=self.shard_size // n,
             spread=spread,
             interleave=self.seed if self.is_packed else None,
         )
+        return found if n == 1 else ClipSelection(found, n)
 
     @property
     def is_packed(self) -> bool:
@@ -255,6 +270,23 @@ class DatasetSpec(FileSpec):
     def shard_samples(self, shard: int) -> Sequence[int]:
         """Return the samples of a shard."""
         return self.selection.shard_samples(shard)
+
+
+def _clip_frames(duration_s: Any, rig: Any) -> int:
+    """Return the number of frames of a sequence from its keys, which must be plain numbers.
+
+    Raises:
+        ValueError: they are not, or cameras have different rates.
+    """
+    cameras = rig.get("cameras") if isinstance(rig, Mapping) else None
+    given = [c.get("frame_rate_hz") for c in cameras if isinstance(c, Mapping)] if isinstance(cameras, list) else []
+    rates = {DEFAULT_RATE_HZ if rate is None else rate for rate in given or [None]}
+    if any(isinstance(rate, Mapping) for rate in given) or not isinstance(duration_s, int | float):
+        raise ValueError("scene.sequence.duration_s: it, and frame_rate_hz of the cameras, must be plain numbers")
+    if len(rates) > 1:
+        raise ValueError("scene.rig.cameras: must have one frame_rate_hz in a dataset of sequences")
+    (rate,) = rates
+    return max(1, int(duration_s * float(rate) + 1e-6)) if isinstance(rate, int | float) else 1
 
 
 def shipped_datasets() -> dict[str, Path]:

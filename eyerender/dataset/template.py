@@ -64,7 +64,8 @@ class PlacedDraw:
 class Turn:
     """Identity of the sample being drawn: index, subject, position in the subject's sequence, and both attempts.
 
-    `place` is its position where the first samples of all subjects come first (`Selection.place_of`).
+    `place` is its position where the first samples of all subjects come first (`Selection.place_of`). In a dataset of
+    sequences, `frames` consecutive samples are a clip.
     """
 
     sample: int
@@ -73,6 +74,17 @@ class Turn:
     attempt: int
     subject_attempt: int
     place: int = 0
+    frames: int = 1
+
+    @property
+    def clip(self) -> int:
+        """Number of the sample's clip."""
+        return self.sample // self.frames
+
+    @property
+    def frame(self) -> int:
+        """Place of the sample in its clip."""
+        return self.sample % self.frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +104,11 @@ class Template:
         source: str = "",
         prefix: str = "",
         variables: Mapping[str, Unit] = MappingProxyType({}),
+        clips: bool = False,
     ) -> Template:
         """Collect and check all draws, and all references to `variables`, which are drawn per sample or subject.
+
+        With `clips`, what would be drawn per sample is drawn per clip.
 
         Raises:
             InputError: with the path of the draw (after `prefix`).
@@ -103,6 +118,8 @@ class Template:
         _collect(tree, "", draws, problems, prefix)
         _check_references(tree, "", variables, problems, prefix)
         problems.check()
+        if clips:
+            draws = {path: _of_clip(placed) for path, placed in draws.items()}
         # Draws are sorted by name, so that the order of keys in a file has no effect.
         return cls(tree, dict(sorted(draws.items())), seed)
 
@@ -129,20 +146,20 @@ class Template:
     def _value(self, placed: PlacedDraw, path: str, turn: Turn) -> tuple[Any, int]:
         """Return the value of a draw, and its index among the draw's values (0 if it has no list of values)."""
         draw, unit = placed.draw, placed.unit
-        number = turn.sample if unit == "sample" else turn.subject
-        attempt = turn.attempt if unit == "sample" else turn.subject_attempt
+        number = {"sample": turn.sample, "clip": turn.clip, "subject": turn.subject}[unit]
+        attempt = {"sample": turn.attempt, "clip": 0, "subject": turn.subject_attempt}[unit]
         if isinstance(draw, FixedDraw):
             return draw.value, 0
         if isinstance(draw, SequenceDraw):
             count = len(draw.values)
-            k = (turn.sequence + mixed(self.seed, "sequence", turn.subject, count)) % count
+            k = (turn.sequence // (turn.frames if unit == "clip" else 1) + mixed(self.seed, "sequence", turn.subject, count)) % count
             return draw.values[k], k
         if isinstance(draw, GridDraw):
             k = self._grid_index(path, unit, number)
             return draw.point(k), k
         if isinstance(draw, SobolDraw) and attempt == 0:
             dimensions = tuple(p for p, d in self.draws.items() if isinstance(d.draw, SobolDraw) and d.unit == unit)
-            at = mixed(self.seed, f"sobol {unit} {dimensions}", turn.place if unit == "sample" else turn.subject, RUN)
+            at = mixed(self.seed, f"sobol {unit} {dimensions}", turn.subject if unit == "subject" else turn.place, RUN)
             points = sobol_block(self.seed, unit, dimensions, at // _BLOCK)
             return random_value(draw, float(points[at % _BLOCK, dimensions.index(path)])), 0
         if isinstance(draw, MultivariateNormalDraw):
@@ -162,6 +179,11 @@ class Template:
                 return number % size
             number //= size
         raise KeyError(path)
+
+
+def _of_clip(placed: PlacedDraw) -> PlacedDraw:
+    """Return a draw that is made per clip, unless it states another unit."""
+    return PlacedDraw(placed.draw, "clip") if placed.unit == "sample" and placed.draw.per is None else placed
 
 
 def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
@@ -268,7 +290,7 @@ def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str,
         if name not in variables:
             known = ", ".join(sorted(variables)) or "none"
             raise InputError(f"there is no variable {name!r}; the spec has {known}")
-        if variables[name] == "sample" and _under(_CHOSEN.sub("", path), FIXED_IDENTITY):
+        if variables[name] != "subject" and _under(_CHOSEN.sub("", path), FIXED_IDENTITY):
             raise InputError(f"the eye must be drawn once per subject; write 'per: subject' for {name!r}")
 
 
@@ -290,7 +312,7 @@ def _placed(node: Any, path: str, source: str, shown: str) -> PlacedDraw:
     bare = _CHOSEN.sub("", path)  # a place has the same meaning inside a choice
     identity = _under(bare, IDENTITY) and not _under(bare, PASSING)
     unit: Unit = draw.per or ("subject" if identity else "sample")
-    if unit == "sample" and _under(bare, FIXED_IDENTITY):
+    if unit != "subject" and _under(bare, FIXED_IDENTITY):
         raise InputError("the eye must be drawn once per subject", source=source, path=f"{shown}.per")
     if isinstance(draw, SequenceDraw) and unit == "subject":
         raise InputError(

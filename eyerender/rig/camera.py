@@ -322,9 +322,10 @@ class Camera(Spec):
     def timing(self, exposure_s: float, pulses_s: Floats) -> Timing:
         """Return the times of its frames; `pulses_s` (m, 2) are the start and end of each light's pulse in a frame."""
         rolling = self.shutter.rolling.row_us * 1e-6 if isinstance(self.shutter, Rolling) else 0.0
-        rate = (self.frame_rate_hz or DEFAULT_RATE_HZ) * (1.0 + (self.clock_ppm or 0.0) * 1e-6)
+        rate = self.frame_rate_hz or DEFAULT_RATE_HZ
         return Timing(
-            period_s=1.0 / rate,
+            rate_hz=rate,
+            period_s=1.0 / (rate * (1.0 + (self.clock_ppm or 0.0) * 1e-6)),
             phase_s=(self.phase_ms or 0.0) * 1e-3,
             exposure_s=exposure_s,
             row_s=rolling,

@@ -66,6 +66,7 @@ class Timing(ArrayValue):
     """Times of one camera's frames.
 
     Attributes:
+        rate_hz: frames per second by the camera's own clock.
         period_s: time from one frame to the next, by the true clock.
         phase_s: start of the first frame.
         exposure_s: exposure time of a row.
@@ -74,6 +75,7 @@ class Timing(ArrayValue):
         pulses_s: (m, 2) start and end of the pulse of each light, after the start of a frame; -inf and inf without one.
     """
 
+    rate_hz: float
     period_s: float
     phase_s: float
     exposure_s: float
@@ -91,8 +93,8 @@ class Timing(ArrayValue):
         return np.asarray(self.phase_s + np.asarray(frame) * self.period_s)
 
     def frames_within(self, duration_s: float) -> int:
-        """Return how many frames a sequence has: as many periods as fit into it, and at least one."""
-        return max(1, int(duration_s / self.period_s + 1e-6))
+        """Return how many frames a sequence has: as many as fit into it by the camera's own clock, and at least one."""
+        return max(1, int(duration_s * self.rate_hz + 1e-6))
 
     def ambient_s(self, start_s: ArrayLike, row: ArrayLike) -> Floats:
         """Return the middle of the exposure of rows, which may be fractions; a row below 0 is the first one."""
