@@ -17,6 +17,7 @@ from .integrator.hostdata import BoundFrame, HostData
 from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, annotated_parts, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
+from .records.frame import DeviceFrame
 from .records.job import RenderJob, SubFrames
 from .records.recording import uncollected
 from .scene.background import Background
@@ -93,8 +94,11 @@ class Renderer:
         marks: tuple[Any, ...] | None = None
         rows: list[tuple[Bools, PartLabels]] = []
         around: Callable[[], Singles] | None = None
+        lit: dict[tuple[float, ...], DeviceFrame] = {}  # a frame for each state of the lamps
         for shot, part in shots:
-            bound, surroundings = self._builder.set(shot, after=None if moments else after)
+            lamps = tuple(lamp.intensity_mw_sr for lamp in shot.lights)
+            bound, surroundings = self._builder.set(shot, after=None if moments else after, before=lit.get(lamps))
+            lit.setdefault(lamps, bound.frame)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
             means = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
             if shot is shots[len(shots) // 2][0]:

@@ -141,7 +141,8 @@ class DatasetTruth:
         frames, observations = found.frames, found.observations
         if frames is None or observations is None:
             return Again((f"the plan gives up sample {number}",))
-        row = _row(observations, record["frame"] - number * self.frames, record["eye"])
+        first = int(observations.index.frame[0]) // self.frames * self.frames  # a clip's frames are numbered on
+        row = _row(observations, first + record["frame"] - number * self.frames, record["eye"])
         if row is None:
             return Again((f"sample {number} has no such image",))
         scene, view = frames.scene, EyeInWindow.of(frames, row)

@@ -101,7 +101,12 @@ class FrameBuilder:
         after.host = self._beside.submit(HostData.compute, after.job, posed)
 
     def set(
-        self, job: RenderJob, *, lit: bool = True, after: RenderJob | None = None
+        self,
+        job: RenderJob,
+        *,
+        lit: bool = True,
+        after: RenderJob | None = None,
+        before: DeviceFrame | None = None,
     ) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye; both are valid until the next call.
 
@@ -109,6 +114,7 @@ class FrameBuilder:
             job: the job.
             lit: whether to compute light, not only geometry.
             after: the job of the next frame, if known.
+            before: a frame a moment ago under the same lamps, whose light from surface to surface is taken over.
         """
         host, surroundings = self._host_data(job)
         region = surroundings if isinstance(surroundings, RegionScene) else None
@@ -116,7 +122,7 @@ class FrameBuilder:
         textures = self._textures.get((look.iris_seed, look.iris), lambda: Textures.of(look))
         # Large kernels that need few inputs are launched first, so that the device is busy while NumPy prepares the
         # rest.
-        shadow_maps = None if region is None else ShadowMaps.build(region, host.shadow_map_table)
+        shadow_maps = before.caches.shadow_maps if before is not None else None if region is None else ShadowMaps.build(region, host.shadow_map_table)
         structure = Structure(
             surfaces=kinds(job.eye),
             distorted=is_distorted(job.camera.distortion),
@@ -139,12 +145,16 @@ class FrameBuilder:
         if job.mesh_edge_mm is not None:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         if lit and structure.scattering and region is not None:
-            frame.caches.diffusion = DiffusedLight.build(frame, job, host.lamps, region, host.tissue_cells)
+            frame.caches.diffusion = before.caches.diffusion if before is not None else DiffusedLight.build(frame, job, host.lamps, region, host.tissue_cells)
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)
             frame.caches.ambience = Ambience.build(even, panels, job.ambient.map, self._maps)
-        if lit:
+        if lit and before is not None:
+            self._fill_grids(host, frame, surroundings)
+            frame.caches.radiosity = before.caches.radiosity
+            self._fill_globe(host, frame, surroundings)
+        elif lit:
             self._light(host, frame, surroundings, after)
         return BoundFrame(frame, host), surroundings
 
@@ -161,6 +171,10 @@ class FrameBuilder:
         gathered = pending.read()
         self._fill_grids(host, frame, surroundings)
         frame.caches.radiosity = pending.solve(gathered)
+        self._fill_globe(host, frame, surroundings)
+
+    def _fill_globe(self, host: HostData, frame: DeviceFrame, surroundings: Background | RegionScene) -> None:
+        """Fill the grid of the lamps' light on a bare globe."""
         if not surroundings.obstructed:
             reach = dr.opaque(mi.Float, min(host.reach_mm, _FARTHEST_MM))
             points = dr.opaque(mi.UInt32, host.lamps.points)
