@@ -26,7 +26,7 @@ import numpy as np
 import torch
 import torch.distributed
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
+from torch.utils.data import DataLoader, Dataset, IterableDataset, WeightedRandomSampler, get_worker_info
 
 from .backends.choose import BackendChoice
 from .base.errors import InputError
@@ -35,6 +35,7 @@ from .dataset.plan import Plan
 from .dataset.realise import frames_of, realise
 from .dataset.spec import DatasetSpec, GeometryKind
 from .dataset.training.augment import Augmentation
+from .dataset.training.clips import Clips
 from .dataset.training.item import PARTS, PICTURES, TrainingItem, person_names
 from .dataset.training.prepare import Preparation, lamps_vary
 from .folders.imagefolder import KINDS, ImageFolder
@@ -50,7 +51,7 @@ _MIXED = 4  # lanes of each worker where images are mixed
 _LOOKED_AT = 16  # samples whose rigs are counted where rigs are drawn
 
 
-__all__ = ["PARTS", "Augment", "FolderDataset", "StreamDataset", "collate", "person_names", "place"]
+__all__ = ["PARTS", "Augment", "ClipDataset", "FolderDataset", "StreamDataset", "collate", "person_names", "place"]
 
 
 def collate(items: Sequence[Parts]) -> dict[str, Any]:
@@ -188,6 +189,78 @@ class FolderDataset(Dataset[Any]):
         where = f"{entry.source}: line {entry.number}"
         item = self.preparation.read(entry.line, lambda kind: entry.pixels(KINDS[kind]), where)
         return _tensors(self.preparation.finish(item, key), self.preparation, entry.line)
+
+
+class ClipDataset(Dataset[Any]):
+    """Clips of a folder of sequences: some frames of a camera in a row, with the labels of the last one.
+
+    The images of a clip are the channels of `image`: the frames in order of time, first those of the right eye, then
+    those of the left eye. The other parts are those of the last frame; with both eyes they have a leading axis, right
+    and left. All images of a clip are changed alike by `augment`.
+
+    `shares` says which shares of the clips have a blink, a saccade, and slippage of the rig. `sampler` draws clips by
+    weights of these kinds.
+
+    Args:
+        path: the folder of a dataset of sequences, or of a rendered scene with a sequence.
+        frames: number of frames of a clip.
+        stride: how many frames the frames of a clip are apart.
+        both_eyes: whether a clip has the images of both eyes, where a camera sees both.
+        split: as for `FolderDataset`.
+        parts: as for `FolderDataset`.
+        size: as for `FolderDataset`.
+        options: further arguments of `FolderDataset`.
+
+    Raises:
+        InputError: the folder holds no such clip, or an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        frames: int = 4,
+        stride: int = 1,
+        both_eyes: bool = True,
+        split: str | None = None,
+        parts: Sequence[str] = ("image",),
+        size: tuple[int, int] | None = None,
+        **options: Any,
+    ) -> None:
+        if "image" not in parts:
+            raise InputError("must hold 'image'", path="parts")
+        same = {"split": split, "size": size, **options}
+        self.last = FolderDataset(path, parts=parts, **same)
+        self.others = FolderDataset(path, parts=("image",), **same)
+        self.clips = Clips.of(self.last.folder, self.last.rows, frames=frames, stride=stride, both_eyes=both_eyes)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Shares of the clips with a blink, a saccade, and slippage."""
+        return self.clips.shares()
+
+    def sampler(self, count: int | None = None, **weights: float) -> WeightedRandomSampler:
+        """Return a sampler that draws `count` clips (default: as many as there are) by the weights of their kinds.
+
+        Raises:
+            InputError: a kind is not `blink`, `saccade` or `slippage`, or a weight is negative.
+        """
+        return WeightedRandomSampler(self.clips.weights(weights).tolist(), len(self) if count is None else count)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, at: int) -> dict[str, Any]:
+        key = _drawn() if self.last.preparation.augment is not None else ()
+        rows = self.clips.rows[at]
+        items = [self.last._image(int(own[-1]), key) for own in rows]
+        images = [
+            [*(self.others._image(int(row), key)["image"] for row in own[:-1]), item["image"]]
+            for own, item in zip(rows, items, strict=True)
+        ]
+        found = items[0] if len(items) == 1 else _joined(items)
+        kept = {name: items[0][name] for name in ("sample", "subject") if name in items[0]}
+        return {**found, **kept, "image": torch.cat([image for own in images for image in own])}
 
 
 class StreamDataset(IterableDataset[Any]):
