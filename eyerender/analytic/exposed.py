@@ -1,8 +1,8 @@
 """Features at their own times: each point of an outline and each glint is seen when its row is exposed to its light.
 
-A point at row v of the picture is seen at the time t(v) in the middle of the light that row v gets (`rig/timing.py`), and
-the eye at time t shows the point at row v(t). Both hold where v = v(t(v)), which is found by iteration: an image moves by
-far less than a row in the time from row to row, so each step shrinks the error by that ratio.
+A point at row v of the picture is seen at the time t(v) in the middle of the light that row v gets (`rig/timing.py`),
+and the eye at time t shows the point at row v(t). Both hold where v = v(t(v)), which is found by iteration: an image
+moves by far less than a row in the time from row to row, so each step shrinks the error by that ratio.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..base.arrays import Floats, Ints
 from ..base.status import Status, mark
 from ..optics.ellipse import fit_ellipse_direct
 from ..rig.rig import RigGeometry
-from ..rig.timing import Timing
+from ..rig.timing import FrameTimes
 from ..scene.observation import Index
 from .features import Features
 
@@ -25,7 +25,7 @@ _Traced = Callable[[Ints, Floats], Features]
 
 
 def at_own_times(
-    seen: Features, index: Index, rig: RigGeometry, timings: tuple[Timing, ...], traced: _Traced
+    seen: Features, index: Index, rig: RigGeometry, timings: tuple[FrameTimes, ...], traced: _Traced
 ) -> tuple[Features, Floats, Floats]:
     """Replace features at the time of their frame by features at their own times.
 
@@ -59,7 +59,10 @@ def at_own_times(
             own = np.arange(len(times))
             points[row] = found.points_px[own[:k], own[:k]]
             status[row] = found.point_status[own[:k], own[:k]]
-            glints[row, lights], lit[row, lights] = found.glints_px[own[k:], lights], found.glint_status[own[k:], lights]
+            glints[row, lights], lit[row, lights] = (
+                found.glints_px[own[k:], lights],
+                found.glint_status[own[k:], lights],
+            )
             before, (times, share) = times, when.of(np.concatenate([points[row, :, 1], glints[row, lights, 0, 1]]))
             if np.abs(times - before).max() < _SETTLED_S:
                 break
@@ -94,7 +97,7 @@ def at_own_times(
 class _Times:
     """When the rows of one frame see `count` points of the pupil, and then the glint of each light."""
 
-    def __init__(self, timing: Timing, start_s: float, lights: Ints, count: int) -> None:
+    def __init__(self, timing: FrameTimes, start_s: float, lights: Ints, count: int) -> None:
         self.timing, self.start_s, self.lights, self.count = timing, start_s, lights, count
 
     def of(self, rows: Floats) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..base.arrays import ArrayValue, Bools, Floats, Statuses
+from ..base.arrays import ArrayValue, Bools, Floats, Indices, Statuses
 from ..base.errors import InputError
 from ..base.status import Status, mark
 from ..eye.batch import CHUNK_POINTS, chunks, groups, slices, take_eyes, take_stops
@@ -140,10 +140,8 @@ def features(
             camera = cameras[number]
             for block, turned in chunks(group, rows[cams[rows] == number], max(1, CHUNK_POINTS // max(m, 4))):
                 pose = Poses(poses.azimuth_rad[block], poses.elevation_rad[block], poses.torsion_rad[block])
-                moved = None if rig_motion is None else (rig_motion[0][block], rig_motion[1][block])
-                view = View.of(turned, pose, position[block], camera, moved)
-                if stops is not None:
-                    turned = replace(turned, stop=take_stops(stops, block))
+                view = View.of(turned, pose, position[block], camera, rows_of(rig_motion, block))
+                turned = _stopped(turned, stops, block)
                 some = np.flatnonzero(lit[block].any(axis=0))
                 for j, order in enumerate(purkinje if len(some) else ()):
                     exits, residual, status = glint_exits(
@@ -159,8 +157,7 @@ def features(
                     glint_residual[at, lamp, j], glint_in_image[at, lamp, j] = residual, camera.in_image(pixels)
                 for inner in slices(len(block), max(1, CHUNK_POINTS // boundary_points)):
                     part, eye, near = block[inner], take_eyes(turned, np.arange(len(block))[inner]), view.rows(inner)
-                    if stops is not None:
-                        eye = replace(eye, stop=take_stops(stops, part))
+                    eye = _stopped(eye, stops, part)
                     # The last point is the stop's centre.
                     exits, residual, status = pupil_exits(eye, boundary_points, near.camera_mm, near.lenses)
                     pixels, status = near.project(exits, status)
@@ -194,6 +191,16 @@ def features(
         glint_residual_mm=glint_residual,
         glint_in_image=glint_in_image,
     )
+
+
+def rows_of(motions: RigidMotions | None, rows: Indices) -> RigidMotions | None:
+    """Select rows of motions, if there are any."""
+    return None if motions is None else (motions[0][rows], motions[1][rows])
+
+
+def _stopped(eye: EyeModel, stops: Stop | None, rows: Indices) -> EyeModel:
+    """Replace the stop of eyes by those of rows, if there are any."""
+    return eye if stops is None else replace(eye, stop=take_stops(stops, rows))
 
 
 def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> None:

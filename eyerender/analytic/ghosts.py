@@ -14,7 +14,7 @@ from ..eye.pose import Poses
 from ..optics.surfaces import Xyz
 from ..rig.rig import RigGeometry
 from ..scene.observation import GlintFeatures, Index, PoseTruth
-from .features import RigidMotions, View
+from .features import RigidMotions, View, rows_of
 from .rays import glint_exits
 
 _STEPS = 8  # each reduces the error by the ratio of the glass's thickness to the distance, a tenth at most
@@ -42,8 +42,7 @@ def ghost_glint_features(
             own = rows[index.camera[rows] == number]
             for block, eye in chunks(group, own, CHUNK_POINTS // 4) if len(own) else ():
                 turn = Poses(pose.azimuth_rad[block], pose.elevation_rad[block], pose.torsion_rad[block])
-                moved = None if rig_motion is None else (rig_motion[0][block], rig_motion[1][block])
-                view = View.of(eye, turn, place[block], camera, moved)
+                view = View.of(eye, turn, place[block], camera, rows_of(rig_motion, block))
                 for k in range(m):
                     xy[block, k], status[block, k] = _seen(view, eye, lights[k : k + 1])
                 inside[block] = camera.in_image(xy[block])

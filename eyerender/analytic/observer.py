@@ -18,7 +18,7 @@ from ..eye.pose import Poses
 from ..optics.ellipse import fit_ellipse_direct
 from ..rig.imaging import Opening
 from ..rig.rig import RigGeometry, RigLike
-from ..rig.timing import Timing
+from ..rig.timing import FrameTimes
 from ..scene.observation import (
     EYES,
     SURFACES,
@@ -58,7 +58,7 @@ class TraceableScene(Protocol):
         ...
 
     @property
-    def timings(self) -> tuple[Timing, ...]:
+    def timings(self) -> tuple[FrameTimes, ...]:
         """When each camera takes its frames."""
         ...
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..analytic.observer import trace
+from ..base.arrays import finite_or_none
 from ..base.errors import EyerenderError, InputError, InputWarning
 from ..folders.outfolder import refuse_non_empty
 from ..imaging.capture import check_windows
@@ -260,7 +261,12 @@ def sample_line(
         record,
         window,
         labels,
-        sample={"sample": turn.sample, "split": sample.split, "sequence_index": turn.sequence},
+        sample={
+            "sample": turn.sample,
+            "split": sample.split,
+            "sequence_index": turn.sequence,
+            "timestamp_s": finite_or_none(observations.index.timestamp_s[row]),
+        },
         drawn={
             "attempt": turn.attempt,
             "subject_attempt": turn.subject_attempt,
@@ -268,6 +274,5 @@ def sample_line(
         },
         tree={**sample.scene, "sensor": {**sample.scene.get("sensor", {}), **exposed}},
         eye=sample.eye or None,
-        timestamp_s=float(observations.index.timestamp_s[row]),
     )
     return image_name(turn.sample, frame, frames, side), line

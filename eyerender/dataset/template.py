@@ -152,7 +152,10 @@ class Template:
             return draw.value, 0
         if isinstance(draw, SequenceDraw):
             count = len(draw.values)
-            k = (turn.sequence // (turn.frames if unit == "clip" else 1) + mixed(self.seed, "sequence", turn.subject, count)) % count
+            k = (
+                turn.sequence // (turn.frames if unit == "clip" else 1)
+                + mixed(self.seed, "sequence", turn.subject, count)
+            ) % count
             return draw.values[k], k
         if isinstance(draw, GridDraw):
             k = self._grid_index(path, unit, number)

@@ -1,14 +1,15 @@
 """EyeLink's text form (ASC) of a trace: samples, and fixations, saccades and blinks as its parser would write them.
 
-Gaze is where the true line of sight meets the screen, with the tracker's noise in degrees; positions are pixels from the
-screen's upper left corner. Pupils are areas of the apparent ellipse in square pixels of the camera, EyeLink's arbitrary
-units. Pursuit belongs to fixations, microsaccades too, as in EyeLink's own files, whose parser knows neither.
+Gaze is where the true line of sight meets the screen, with the tracker's noise in degrees; positions are pixels from
+the screen's upper left corner. Pupils are areas of the apparent ellipse in square pixels of the camera, in EyeLink's
+arbitrary units. Pursuit belongs to fixations, microsaccades too, as in EyeLink's own files, whose parser knows neither.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -90,8 +91,12 @@ def _gaze(trace: Trace, rows: Ints, screen_px: tuple[int, int]) -> _Gaze:
     pixels = np.where(ahead[:, None], (place * (1, -1)) * scale + (np.array(screen_px) - 1) / 2, np.nan)
     pupil = seen.pupil.take(rows)
     area = np.where(pupil.ok, np.pi * np.prod(pupil.semi_axes_px, axis=1), np.nan)
-    kind = np.array([_kind(words, lost) for words, lost in zip(seen.index.events[rows], ~np.isfinite(area), strict=True)])
-    return _Gaze(place_px=np.where(np.isfinite(area)[:, None], pixels, np.nan), direction=direction, area=area, kind=kind)
+    kind = np.array(
+        [_kind(words, lost) for words, lost in zip(seen.index.events[rows], ~np.isfinite(area), strict=True)]
+    )
+    return _Gaze(
+        place_px=np.where(np.isfinite(area)[:, None], pixels, np.nan), direction=direction, area=area, kind=kind
+    )
 
 
 def _kind(words: str | None, lost: bool) -> str:
@@ -132,7 +137,12 @@ def _body(series: dict[int, _Gaze], times_ms: Floats) -> Iterator[str]:
                 yield f"S{_ENDS[run.kind]} {_LETTERS[eye]}   {_time(time_ms)}"
         cells = [_sample(one, k) for one in series.values()]
         lost = any(one.missing[k] for one in series.values())
-        yield f"{_time(time_ms)}\t" + "\t".join(cells) + ("\tC" if lost else "\t") + ("..." if len(series) == 1 else ".....")
+        yield (
+            f"{_time(time_ms)}\t"
+            + "\t".join(cells)
+            + ("\tC" if lost else "\t")
+            + ("..." if len(series) == 1 else ".....")
+        )
         for eye, one in series.items():
             if (run := ends.get((eye, k))) is not None:
                 yield _end(run, one, _LETTERS[eye], times_ms)
@@ -141,7 +151,7 @@ def _body(series: dict[int, _Gaze], times_ms: Floats) -> Iterator[str]:
 def _runs(kind: Objects) -> list[_Run]:
     """Divide a series into runs of one kind."""
     edges = np.flatnonzero(np.concatenate([[True], kind[1:] != kind[:-1], [True]])).tolist()
-    return [_Run(str(kind[a]), a, b - 1) for a, b in zip(edges, edges[1:], strict=False)]
+    return [_Run(str(kind[a]), a, b - 1) for a, b in pairwise(edges)]
 
 
 def _sample(one: _Gaze, k: int) -> str:

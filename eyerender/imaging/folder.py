@@ -7,6 +7,7 @@ from typing import Any
 
 from ..analytic.observer import trace
 from ..backends.choose import BackendChoice
+from ..base.arrays import finite_or_none
 from ..base.errors import InputError, Warn
 from ..base.progress import Progress
 from ..folders.imagefile import Writer
@@ -63,9 +64,8 @@ def render_folder(
         for kind in ("images", "masks", *(["lens_reflections"] if worn else [])):
             (folder / kind).mkdir()
         for image in render_windows(frames, backend=backend, threads=threads, progress=progress):
-            stored_s = float(truth.index.timestamp_s[image.row])
-            labels = image_labels(image, truth)
-            line = image_line(scene, records[image.row], image.window, labels, timestamp_s=stored_s)
+            stored = {"timestamp_s": finite_or_none(truth.index.timestamp_s[image.row])}
+            line = image_line(scene, records[image.row], image.window, image_labels(image, truth), sample=stored)
             line |= {"file_name": f"images/{image.name}.png", "mask_file_name": f"masks/{image.name}.png"}
             writer.put(folder / line["file_name"], image.counts)
             writer.put(folder / line["mask_file_name"], image.parts)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..base.arrays import finite_or_none
 from ..eye.spectacles import lenses_of
 from ..folders.imagefolder import FILE_KEYS, IMAGE_SCHEMA
 from ..rig.camera import Window
@@ -28,7 +26,6 @@ def image_line(
     drawn: Mapping[str, Any] | None = None,
     tree: Mapping[str, Any] | None = None,
     eye: Mapping[str, Any] | None = None,
-    timestamp_s: float = math.nan,
 ) -> dict[str, Any]:
     """Return the line of an image; the keys of files are null.
 
@@ -37,11 +34,10 @@ def image_line(
         record: the record of the eye that it shows.
         window: (x0, y0, width, height) in full-sensor pixels.
         labels: its labels.
-        sample: values of `SAMPLE_KEYS`, in a dataset.
+        sample: `timestamp_s`, the time that the camera stored, and in a dataset values of `SAMPLE_KEYS`.
         drawn: values of `DRAWN_KEYS`, in a dataset.
         tree: keys of the scene; default: all.
         eye: keys of the eye file; default: those of the scene's eye.
-        timestamp_s: time that the camera stored; NaN if it stored none.
     """
     tree = scene.spec.to_mapping() if tree is None else tree
     eye = scene.eye_file(record["eye"]).to_mapping() if eye is None else eye
@@ -50,9 +46,9 @@ def image_line(
         "schema": IMAGE_SCHEMA,
         **dict.fromkeys(FILE_KEYS),
         **dict.fromkeys(SAMPLE_KEYS),
-        **(sample or {}),
         **{key: record[key] for key in ("subject", "instant", "time_s", "rig_pose")},
-        "timestamp_s": finite_or_none(timestamp_s),
+        "timestamp_s": None,
+        **(sample or {}),
         "window_px": dict(zip(("x0", "y0", "width", "height"), window, strict=True)),
         "bit_depth": spec.sensor.bit_depth,
         "gamma": spec.sensor.gamma,

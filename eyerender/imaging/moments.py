@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,7 +88,7 @@ def _in_sequence(
     lights = np.array(scene.rig.lights_of(int(index.eye[row])), dtype=np.int64)
     rows = np.arange(middle.window[3]) + middle.window[1]
     edges, on = timing.segments(int(rows[0]), int(rows[-1]), lights)
-    counts = [_steps_of(frames, row, middle, start + low, start + high) for low, high in zip(edges, edges[1:], strict=False)]
+    counts = [_steps_of(frames, row, middle, start + low, start + high) for low, high in pairwise(edges)]
     if len(counts) == 1 and counts[0] == 1 and on.all():
         return ()
     parts, labelled = [], _Labelled(timing.seen([start], rows[None], lights).time_s[0], start, edges, counts)
@@ -119,7 +120,7 @@ class _Labelled:
     """Which rows of a rolling shutter have the raster labels of which moment: the one nearest to the row's light."""
 
     def __init__(self, lit_s: Floats, start_s: float, edges_s: Floats, counts: list[int]) -> None:
-        inner = [np.linspace(low, high, n + 1) for low, high, n in zip(edges_s, edges_s[1:], counts, strict=False)]
+        inner = [np.linspace(low, high, n + 1) for (low, high), n in zip(pairwise(edges_s), counts, strict=True)]
         middles = np.concatenate([(edge[:-1] + edge[1:]) / 2.0 for edge in inner])
         self.first = np.cumsum([0, *counts])
         when = np.where(np.isfinite(lit_s), lit_s - start_s, 0.0)

@@ -46,7 +46,7 @@ from .distortion import (
 from .mirror import Mirror as Mirror
 from .mirror import MirrorPlate
 from .opencv import read_opencv
-from .timing import DEFAULT_RATE_HZ, Rolling, Shutter, Timing
+from .timing import DEFAULT_RATE_HZ, FrameTimes, Rolling, Shutter
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
@@ -319,11 +319,11 @@ class Camera(Spec):
         camera = camera if self.mirror is None else camera.seen_in(self.mirror)
         return camera if self.flip is None else camera.flipped()
 
-    def timing(self, exposure_s: float, pulses_s: Floats) -> Timing:
+    def timing(self, exposure_s: float, pulses_s: Floats) -> FrameTimes:
         """Return the times of its frames; `pulses_s` (m, 2) are the start and end of each light's pulse in a frame."""
         rolling = self.shutter.rolling.row_us * 1e-6 if isinstance(self.shutter, Rolling) else 0.0
         rate = self.frame_rate_hz or DEFAULT_RATE_HZ
-        return Timing(
+        return FrameTimes(
             rate_hz=rate,
             period_s=1.0 / (rate * (1.0 + (self.clock_ppm or 0.0) * 1e-6)),
             phase_s=(self.phase_ms or 0.0) * 1e-3,

@@ -310,9 +310,13 @@ def _check_pulse(light: Led, rates_hz: tuple[float, ...], path: str) -> None:
         return
     end_s, share = light.pulse.span_s[1], light.pulsed_share(rates_hz)
     if end_s > (1.0 + 1e-9) / max(rates_hz):
-        raise KeyProblem(f"{path}.pulse", f"ends after {1e3 * end_s:g} ms, but a frame takes {1e3 / max(rates_hz):g} ms")
+        raise KeyProblem(
+            f"{path}.pulse", f"ends after {1e3 * end_s:g} ms, but a frame takes {1e3 / max(rates_hz):g} ms"
+        )
     if light.duty_cycle is not None and abs(light.duty_cycle - share) > 0.01 * share:
-        raise KeyProblem(f"{path}.duty_cycle", f"is {light.duty_cycle:g}, but the pulses and frame rates make {share:g}")
+        raise KeyProblem(
+            f"{path}.duty_cycle", f"is {light.duty_cycle:g}, but the pulses and frame rates make {share:g}"
+        )
 
 
 def _listed(eyes: tuple[Side, ...] | None) -> list[Side] | None:

@@ -1,8 +1,8 @@
 """When cameras expose: frame rates, clocks, shutters of rows, and pulses of LEDs.
 
-Row r of frame k is exposed from t_k + r t_row on, with t_k = phase + k / (rate (1 + ppm 1e-6)); t_row is 0 with a global
-shutter. A row receives the light of a pulse only while it is exposed: its light is the overlap, its time the middle of
-the overlap. LEDs without a pulse, and all other light, are always on.
+Row r of frame k is exposed from t_k + r t_row on, with t_k = phase + k / (rate (1 + ppm 1e-6)); t_row is 0 with a
+global shutter. A row receives the light of a pulse only while it is exposed: its light is the overlap, its time the
+middle of the overlap. LEDs without a pulse, and all other light, are always on.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ class Pulse(Spec):
 
 
 class Light(NamedTuple):
-    """What a row gets of a pulse, arrays of one shape: the middle of the overlap (s; NaN without one), and its share."""
+    """What rows get of a pulse, arrays of one shape: the middle of the overlap (s; NaN without one), and its share."""
 
     time_s: Floats
     share: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Timing(ArrayValue):
+class FrameTimes(ArrayValue):
     """Times of one camera's frames.
 
     Attributes:
@@ -140,4 +140,3 @@ class Timing(ArrayValue):
         begin = rows * self.row_s
         inside = np.clip(edges_s[:, None], begin, begin + self.exposure_s)
         return np.asarray(np.diff(inside, axis=0) / self.exposure_s)
-

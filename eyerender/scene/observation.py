@@ -394,16 +394,7 @@ class Observations(ArrayValue):
             if name is not None and name not in EYES:
                 reader.refuse(k, "eye", "must be 'right' or 'left'")
                 eye[k] = None
-        head, reason = reader.array("head_mm", (3,)), reader.texts("pupil.reason")
-        centre, semi_axes = reader.array("pupil.centre_px", (2,)), reader.array("pupil.semi_axes_px", (2,))
-        placed = np.asarray(np.isfinite(centre).all(axis=1))
-        status = reader.statuses("pupil.status", reason, placed)
-        for row in np.flatnonzero(status == Status.OK).tolist():
-            centre_given, axes_given = (
-                rows[row].get("pupil", {}).get(key) is not None for key in ("centre_px", "semi_axes_px")
-            )
-            if not centre_given or (semi_axes[row] <= 0).any() or (complete and not axes_given):
-                reader.refuse(row, "pupil", "is 'ok', but has no centre or semi-axes")
+        head, pupil = reader.array("head_mm", (3,)), reader.pupils()
         found = cls(
             index=Index(
                 frame=reader.frames(),
@@ -428,21 +419,7 @@ class Observations(ArrayValue):
                 torsion_rad=np.radians(reader.array("pose.torsion_deg", ())),
                 residual_mm=reader.array("pose.residual_mm", ()),
             ),
-            pupil=PupilFeatures(
-                status=status,
-                reason=reason,
-                in_image=reader.flags("pupil.in_image"),
-                centre_px=centre,
-                semi_axes_px=semi_axes,
-                angle_rad=reader.array("pupil.angle_rad", ()),
-                anatomical_centre_px=reader.array("pupil.anatomical_centre_px", (2,)),
-                points_px=reader.points("pupil.points_px"),
-                covariance=reader.array("pupil.covariance", (5, 5)),
-                arcs_deg=reader.points("pupil.arcs_deg", "arcs [from, to]"),
-                arc_ellipse=reader.arc_ellipses(),
-                confidence=reader.array("confidence", (), optional=True),
-                time_s=reader.array("pupil.time_s", ()),
-            ),
+            pupil=pupil,
             glints=GlintFeatures(**reader.glints("glints")),
             lens_glints=reader.lens_glints(),
             ghost_glints=reader.ghost_glints(),
@@ -584,6 +561,34 @@ class _Reader:
                 self.refuse(k, "pupil.arc_ellipse", f"must be null or an object of {', '.join(_ELLIPSE_KEYS)}")
         return frozen(out)
 
+    def pupils(self) -> PupilFeatures:
+        """Read the pupils; one that is 'ok' needs a centre and semi-axes."""
+        reason = self.texts("pupil.reason")
+        centre, semi_axes = self.array("pupil.centre_px", (2,)), self.array("pupil.semi_axes_px", (2,))
+        placed = np.asarray(np.isfinite(centre).all(axis=1))
+        status = self.statuses("pupil.status", reason, placed)
+        for row in np.flatnonzero(status == Status.OK).tolist():
+            centre_given, axes_given = (
+                self.records[row].get("pupil", {}).get(key) is not None for key in ("centre_px", "semi_axes_px")
+            )
+            if not centre_given or (semi_axes[row] <= 0).any() or (self.complete and not axes_given):
+                self.refuse(row, "pupil", "is 'ok', but has no centre or semi-axes")
+        return PupilFeatures(
+            status=status,
+            reason=reason,
+            in_image=self.flags("pupil.in_image"),
+            centre_px=centre,
+            semi_axes_px=semi_axes,
+            angle_rad=self.array("pupil.angle_rad", ()),
+            anatomical_centre_px=self.array("pupil.anatomical_centre_px", (2,)),
+            points_px=self.points("pupil.points_px"),
+            covariance=self.array("pupil.covariance", (5, 5)),
+            arcs_deg=self.points("pupil.arcs_deg", "arcs [from, to]"),
+            arc_ellipse=self.arc_ellipses(),
+            confidence=self.array("confidence", (), optional=True),
+            time_s=self.array("pupil.time_s", ()),
+        )
+
     def events(self) -> Objects:
         """Read lists of events as words joined by +."""
         out = np.full(len(self.records), None, dtype=object)
@@ -651,12 +656,8 @@ class _Reader:
                 light[k, j] = -1 if g["light"] is None else g["light"]
                 status[k, j] = int(Status.of_record(g["status"], g["reason"]))
                 reason[k, j], inside[k, j] = g["reason"], bool(g["in_image"])
-                if g["xy_px"] is not None:
-                    xy[k, j] = g["xy_px"]
-                if g["covariance"] is not None:
-                    covariance[k, j] = g["covariance"]
-                if g["time_s"] is not None:
-                    time_s[k, j] = g["time_s"]
+                for name, numbers in (("xy_px", xy), ("covariance", covariance), ("time_s", time_s)):
+                    numbers[k, j] = np.nan if g[name] is None else g[name]
         return {
             "light": light, "status": status, "reason": reason,
             "in_image": inside, "xy_px": xy, "covariance": covariance, "time_s": time_s,

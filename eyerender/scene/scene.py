@@ -52,9 +52,8 @@ from ..rig.plausibility import (
 )
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..rig.sensor import Sensor
-from ..rig.timing import Timing
+from ..rig.timing import FrameTimes
 from .observation import EYES, Index, PoseTruth
-from .sequence.habits import Habits
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
 from .timeline import at_other_times, instants_of, rig_motions, rows_at, rows_in_time, single_stop, stops_of
 
@@ -175,8 +174,8 @@ class Scene:
             subject: the subject, with the eye model.
             rig: cameras, lights and screen.
             name: name of the scene in reports.
-            fields: the other fields of `SceneSpec`: `targets`, `poses` or `sequence`, `region`, `look`, `sensor`, `lens`,
-                `ambient`, `motion`, `image`, `wavelength_nm`, `seed`, `description`.
+            fields: the other fields of `SceneSpec`: `targets`, `poses` or `sequence`, `region`, `look`, `sensor`,
+                `lens`, `ambient`, `motion`, `image`, `wavelength_nm`, `seed`, `description`.
 
         Raises:
             InputError: a value does not fit, or an eye is impossible.
@@ -659,17 +658,7 @@ class Scene:
         return Frames(self, *rows_at(self, time_s))
 
     @property
-    def habits(self) -> Habits:
-        """Habits of the person's eyes in time."""
-        return Habits()
-
-    @property
-    def sequence_targets_mm(self) -> Floats | None:
-        """World points that a sequence names."""
-        return None
-
-    @property
-    def timings(self) -> tuple[Timing, ...]:
+    def timings(self) -> tuple[FrameTimes, ...]:
         """When each camera takes its frames."""
         pulses = np.array([light.pulse_s for light in self.rig.lights], dtype=float).reshape(-1, 2)
         exposure_s = self.spec.sensor.time_ms * 1e-3

@@ -35,7 +35,7 @@ from ..rig.imaging import Ambient, Lens, Motion, Picture
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from .observation import MAX_GLINTS
-from .sequence.spec import Sequence
+from .sequence.spec import GazeModel, Sequence
 
 DATASET_KIND = "dataset"
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -318,6 +318,9 @@ class SceneSpec(FileSpec):
             raise KeyProblem("motion", "cannot stand beside a sequence, which moves eyes and head")
         if len(self.subject.head_positions_mm) > 1:
             raise KeyProblem("subject.head_positions_mm", "must be one with a sequence, which moves the head")
+        gaze = self.sequence.gaze if self.sequence is not None else None
+        if isinstance(gaze, GazeModel) and (gaze.grid or gaze.screen_mm) and self.rig.screen is None:
+            raise KeyProblem("sequence.gaze", "targets on a screen need rig.screen")
         if self.sensor.field_delay_ms:
             raise KeyProblem("sensor.field_delay_ms", "cannot stand beside a sequence so far")
         lenses = [lens for side in EYES for lens in lenses_of(self.subject.spectacles, side)]

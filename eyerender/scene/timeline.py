@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,18 +22,59 @@ from ..base.status import Status
 from ..eye.batch import stack_stops
 from ..eye.build import fitting_stop
 from ..eye.fixation import fixations
-from ..eye.model import Stop
-from ..rig.timing import Timing
+from ..eye.model import EyeModel, Stop
+from ..eye.spec import EyeSpec
+from ..rig.rig import RigGeometry
+from ..rig.timing import FrameTimes
 from .observation import EVENTS, EYES, Index, PoseTruth
-from .sequence.course import Course
+from .sequence.course import MovingEyes
+from .sequence.habits import Habits
+from .sequence.spec import GazeModel
 from .sequence.states import BLINK_PHASES
-from .spec import MAX_OBSERVATIONS
-
-if TYPE_CHECKING:
-    from .scene import Scene
+from .spec import MAX_OBSERVATIONS, SceneSpec
 
 
-def course_of(scene: Scene) -> Course:
+class TimedScene(Protocol):
+    """What the frames in time need of a `Scene`."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """What the scene's file says."""
+        ...
+
+    @property
+    def rig(self) -> RigGeometry:
+        """The numeric rig."""
+        ...
+
+    @property
+    def timings(self) -> tuple[FrameTimes, ...]:
+        """When each camera takes its frames."""
+        ...
+
+    @property
+    def eye_name(self) -> str:
+        """Name of the eye file."""
+        ...
+
+    def eye(self, side: str) -> EyeModel:
+        """Build the numeric eye of one side."""
+        ...
+
+    def eye_file(self, side: str) -> EyeSpec:
+        """Return the eye file of one side."""
+        ...
+
+    def responding_file(self, side: str) -> EyeSpec:
+        """Return the eye file that the numeric eye is built from."""
+        ...
+
+    def eye_position_mm(self, side: str) -> Floats:
+        """Return the apex of an unrotated eye."""
+        ...
+
+
+def course_of(scene: TimedScene) -> MovingEyes:
     """Return the course of a scene's sequence; scenes that differ in other things share it."""
     spec, rest = scene.spec, scene.spec.to_mapping()
     parts = {name: rest.get(name) for name in ("eye", "person", "wavelength_nm")}
@@ -49,20 +90,33 @@ class _Keyed:
     """A scene, compared by what its course depends on."""
 
     key: str
-    scene: Scene = field(compare=False)
+    scene: TimedScene = field(compare=False)
 
 
 @lru_cache(maxsize=8)
-def _course(keyed: _Keyed) -> Course:
+def _course(keyed: _Keyed) -> MovingEyes:
     scene = keyed.scene
-    assert scene.spec.sequence is not None
+    sequence, person = scene.spec.sequence, scene.spec.person
+    assert sequence is not None
+    who = (sequence.seed & 0xFFFFFFFF,) if person is None else (person.seed & 0xFFFFFFFF, person.subject)
+    resting = np.array([_resting_mm(scene, side) for side in EYES])
     try:
-        return scene.spec.sequence.build(_aim(scene), scene.habits, scene.sequence_targets_mm)
+        if isinstance(sequence.gaze, GazeModel):
+            sequence = sequence.model_copy(update={"gaze": sequence.gaze.placed(scene.rig.screen)})
+        return sequence.build(_aim(scene), Habits.drawn(who), resting)
+    except ValueError as error:
+        raise InputError(str(error), path="sequence.gaze") from None
     except InputError as error:
         raise error.placed(under="sequence") from None
 
 
-def _aim(scene: Scene) -> Callable[[Floats, Floats, int], tuple[Floats, Floats]]:
+def _resting_mm(scene: TimedScene, side: str) -> float:
+    """Return the diameter of the stop at rest; that of the other eye where only one is observed."""
+    own = side if side in scene.spec.subject.eyes else scene.spec.subject.eyes[0]
+    return scene.responding_file(own).stop.diameter_mm if (given := scene.spec.eye.pupil_diameter_mm) is None else given
+
+
+def _aim(scene: TimedScene) -> Callable[[Floats, Floats, int], tuple[Floats, Floats]]:
     """Return the function that turns an eye, whose pupil is at rest, towards targets."""
 
     def aim(targets_mm: Floats, head_mm: Floats, eye: int) -> tuple[Floats, Floats]:
@@ -90,7 +144,7 @@ class _Exposures:
     start_s: Floats
 
 
-def _exposures(scene: Scene, timings: tuple[Timing, ...]) -> _Exposures:
+def _exposures(scene: TimedScene, timings: tuple[FrameTimes, ...]) -> _Exposures:
     """Return the frames of all cameras that see an eye, joined to instants."""
     sequence = scene.spec.sequence
     assert sequence is not None
@@ -108,16 +162,18 @@ def _exposures(scene: Scene, timings: tuple[Timing, ...]) -> _Exposures:
         parts.append((nearest.astype(np.int64), np.full(len(own), c), number, timings[c].start_s(number)))
     instant, camera, number, start = (np.concatenate(column) for column in zip(*parts, strict=True))
     chosen = np.ones(len(instant), bool) if sequence.instants is None else np.isin(instant, sequence.instants)
+    if sequence.timestamps is not None and sequence.instants is None:
+        chosen &= ~sequence.timestamps.dropped(number, camera)
     order = np.lexsort((camera, instant))
     order = order[chosen[order]]
     return _Exposures(instant[order], camera[order], number[order], start[order])
 
 
-def _middle_s(timing: Timing, number: Ints) -> Floats:
+def _middle_s(timing: FrameTimes, number: Ints) -> Floats:
     return timing.ambient_s(timing.start_s(number), (timing.rows - 1) / 2)
 
 
-def instants_of(scene: Scene) -> int:
+def instants_of(scene: TimedScene) -> int:
     """Return how many instants a sequence has: the frames of its fastest camera."""
     assert scene.spec.sequence is not None
     timings = scene.timings
@@ -125,7 +181,7 @@ def instants_of(scene: Scene) -> int:
     return max(timings[c].frames_within(scene.spec.sequence.duration_s) for c in used)
 
 
-def rows_in_time(scene: Scene) -> tuple[Index, PoseTruth]:
+def rows_in_time(scene: TimedScene) -> tuple[Index, PoseTruth]:
     """Return the rows of all frames of a sequence, in the order of instants, cameras and eyes."""
     timings = scene.timings
     frames = _exposures(scene, timings)
@@ -142,7 +198,7 @@ def rows_in_time(scene: Scene) -> tuple[Index, PoseTruth]:
     return posed(scene, {**known, "frame": frames.instant[row] * len(scene.rig.cameras) + camera}, when)
 
 
-def rows_at(scene: Scene, time_s: ArrayLike) -> tuple[Index, PoseTruth]:
+def rows_at(scene: TimedScene, time_s: ArrayLike) -> tuple[Index, PoseTruth]:
     """Return rows at any times (k,), of every camera and eye, whatever the rates of the cameras are."""
     times = np.atleast_1d(np.asarray(time_s, dtype=float))
     eyes = [EYES.index(side) for side in EYES if side in scene.spec.subject.eyes]
@@ -153,11 +209,11 @@ def rows_at(scene: Scene, time_s: ArrayLike) -> tuple[Index, PoseTruth]:
     return posed(scene, {**known, "frame": instant * len(scene.rig.cameras) + camera}, times[instant])
 
 
-def _sees(scene: Scene, camera: int, eye: int) -> bool:
+def _sees(scene: TimedScene, camera: int, eye: int) -> bool:
     return scene.rig.cameras[camera].sees(EYES[eye])
 
 
-def _lit_s(scene: Scene, timing: Timing, start_s: float, eye: int) -> float:
+def _lit_s(scene: TimedScene, timing: FrameTimes, start_s: float, eye: int) -> float:
     """Return the middle of the light that the middle row of a frame gets, or of its exposure if it gets none."""
     middle = (timing.rows - 1) / 2
     lights = np.array(scene.rig.lights_of(eye), dtype=np.int64)
@@ -165,7 +221,7 @@ def _lit_s(scene: Scene, timing: Timing, start_s: float, eye: int) -> float:
     return when if np.isfinite(when) else float(timing.ambient_s(start_s, middle))
 
 
-def posed(scene: Scene, known: dict[str, Any], time_s: Floats) -> tuple[Index, PoseTruth]:
+def posed(scene: TimedScene, known: dict[str, Any], time_s: Floats) -> tuple[Index, PoseTruth]:
     """Return rows of known identity (`frame`, `instant`, `camera`, `eye`, ...) at their times (n,)."""
     times, back = np.unique(time_s, return_inverse=True)
     states, back = course_of(scene).at(times), back.reshape(-1)
@@ -202,7 +258,7 @@ def posed(scene: Scene, known: dict[str, Any], time_s: Floats) -> tuple[Index, P
     return index, pose
 
 
-def at_other_times(scene: Scene, index: Index, time_s: Floats) -> tuple[Index, PoseTruth]:
+def at_other_times(scene: TimedScene, index: Index, time_s: Floats) -> tuple[Index, PoseTruth]:
     """Return the same rows at other times (n,)."""
     kept = ("frame", "instant", "camera", "eye", "start_s", "timestamp_s", "subject")
     return posed(scene, {name: getattr(index, name) for name in kept}, time_s)
@@ -214,7 +270,7 @@ def _orbit_axes() -> Floats:
     return np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.cos(turn), np.sin(turn), 0.0]])
 
 
-def _whole_motion(scene: Scene, rotation_rad: Floats, translation_mm: Floats) -> tuple[Floats, Floats]:
+def _whole_motion(scene: TimedScene, rotation_rad: Floats, translation_mm: Floats) -> tuple[Floats, Floats]:
     """Return the rig's motion (n, 3), (n, 3) with its mount, which comes first; NaN if there is neither."""
     mount = scene.spec.rig.mount
     if mount is None:
@@ -226,7 +282,7 @@ def _whole_motion(scene: Scene, rotation_rad: Floats, translation_mm: Floats) ->
     return (turn * Rotation.from_matrix(R)).as_rotvec(), turn.apply(offset) + translation_mm
 
 
-def rig_motions(scene: Scene, index: Index) -> tuple[Floats, Floats] | None:
+def rig_motions(scene: TimedScene, index: Index) -> tuple[Floats, Floats] | None:
     """Return the motions R (n, 3, 3), t (n, 3) that a sequence gives the rig beyond its mount; None if it is still."""
     if scene.spec.sequence is None or not np.isfinite(index.rig_rotation_rad).any():
         return None
@@ -243,7 +299,7 @@ def _moves(turns: Floats, shifts: Floats) -> bool:
     return bool(np.abs(turns - np.eye(3)).max(initial=0.0) > 1e-15 or np.abs(shifts).max(initial=0.0) > 1e-13)
 
 
-def stops_of(scene: Scene, index: Index) -> Stop | None:
+def stops_of(scene: TimedScene, index: Index) -> Stop | None:
     """Return the stop of each row, in its eye's frame; None if all rows have that of their eye."""
     if scene.spec.sequence is None:
         return None
@@ -261,7 +317,7 @@ def stops_of(scene: Scene, index: Index) -> Stop | None:
     )
 
 
-def _stop(scene: Scene, side: str, diameter_mm: float) -> Stop:
+def _stop(scene: TimedScene, side: str, diameter_mm: float) -> Stop:
     """Return the stop of one eye at a diameter; 0 is its own."""
     if diameter_mm == 0.0:
         return scene.eye(side).stop

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...analytic.observer import trace
-from ...base.arrays import Bools, Floats
+from ...base.arrays import Bools, Floats, finite_or_none
 from ...base.errors import WRONG, InputError
 from ...base.storage.files import parse_json, shown
 from ...folders.imagefolder import DATASET, FILE_KEYS, KINDS, RESULTS, ImageFolder, shard_name, versions
@@ -211,8 +211,8 @@ class SceneTruth:
             return Again(("the scene has no such image",))
         view = EyeInWindow.of(self.frames, row)
         (own,) = found.take([row]).records()
-        stored_s = float(found.index.timestamp_s[row])
-        expected = image_line(scene, own, view.window, known_labels(scene, found, view), timestamp_s=stored_s)
+        stored = {"timestamp_s": finite_or_none(found.index.timestamp_s[row])}
+        expected = image_line(scene, own, view.window, known_labels(scene, found, view), sample=stored)
         problems = [*_differences(_open(expected), _open(line)), *_spots(scene, view, line)]
         problems += _lids(scene, view, line)
         return Again(tuple(problems), _limbus(scene, view))

@@ -122,7 +122,13 @@ class FrameBuilder:
         textures = self._textures.get((look.iris_seed, look.iris), lambda: Textures.of(look))
         # Large kernels that need few inputs are launched first, so that the device is busy while NumPy prepares the
         # rest.
-        shadow_maps = before.caches.shadow_maps if before is not None else None if region is None else ShadowMaps.build(region, host.shadow_map_table)
+        shadow_maps = (
+            before.caches.shadow_maps
+            if before is not None
+            else None
+            if region is None
+            else ShadowMaps.build(region, host.shadow_map_table)
+        )
         structure = Structure(
             surfaces=kinds(job.eye),
             distorted=is_distorted(job.camera.distortion),
@@ -145,7 +151,11 @@ class FrameBuilder:
         if job.mesh_edge_mm is not None:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         if lit and structure.scattering and region is not None:
-            frame.caches.diffusion = before.caches.diffusion if before is not None else DiffusedLight.build(frame, job, host.lamps, region, host.tissue_cells)
+            frame.caches.diffusion = (
+                before.caches.diffusion
+                if before is not None
+                else DiffusedLight.build(frame, job, host.lamps, region, host.tissue_cells)
+            )
         if structure.ambient:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)

@@ -1,0 +1,1 @@
+"""Eyes, lids, pupils, head and rig as functions of time."""
