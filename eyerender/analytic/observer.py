@@ -164,7 +164,8 @@ class AnalyticObserver:
                 path="purkinje",
             )
         seen = self._traced(frames, purkinje)
-        pupil_s, glint_s = None, None
+        pupil_s = np.full(len(index), np.nan)
+        glint_s = np.full(seen.glint_status.shape[:2], np.nan)
         if len(index) and np.isfinite(index.start_s).all():
             seen, pupil_s, glint_s = at_own_times(
                 seen, index, scene.rig, scene.timings, lambda rows, at: self._traced(frames.at(rows, at), purkinje)

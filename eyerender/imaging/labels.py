@@ -32,7 +32,8 @@ from ..rig.rig import RigGeometry
 from ..scene.observation import EYES, Index, Observations
 from ..scene.parts import IRIS, PUPIL
 from ..scene.viewer import past_lenses
-from .capture import EyeImage, eye_motion, rest_mm
+from .capture import EyeImage
+from .moments import eye_motion, rest_mm
 from .renderable import RenderableFrames, RenderableScene
 
 RIM_HIDDEN = "the cornea hides a part of its rim"

@@ -69,7 +69,7 @@ def _at_constant_speed(frames: RenderableFrames, row: int, motion: Motion, middl
         out.append(replace(middle, **moved, seed=seed, labels=False))
     if not delay:
         return (SubFrames(jobs=tuple(out)),)
-    odd = (np.arange(middle.window[3]) + middle.window[1]) % 2.0
+    odd = np.asarray((np.arange(middle.window[3]) + middle.window[1]) % 2, dtype=float)
     first, second = tuple(out[: motion.steps]), tuple(out[motion.steps :])
     return SubFrames(jobs=first, rows=1.0 - odd), SubFrames(jobs=second, rows=odd)
 

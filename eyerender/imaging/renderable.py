@@ -168,6 +168,10 @@ class RenderableFrames(Traceable, Protocol):
         """Select rows."""
         ...
 
+    def at(self, rows: Any, time_s: Floats) -> RenderableFrames:
+        """Select rows of a sequence and return their eyes at other times, s."""
+        ...
+
     def of_scene(self, scene: Any) -> Self:
         """Keep the eyes and poses in another scene."""
         ...

@@ -90,7 +90,7 @@ class FrameTimes(ArrayValue):
 
     def start_s(self, frame: ArrayLike) -> Floats:
         """Return when the exposure of the first row of frames begins."""
-        return np.asarray(self.phase_s + np.asarray(frame) * self.period_s)
+        return np.asarray(self.phase_s + np.asarray(frame, dtype=float) * self.period_s)
 
     def frames_within(self, duration_s: float) -> int:
         """Return how many frames a sequence has: as many as fit into it by the camera's own clock, and at least one."""
@@ -99,7 +99,7 @@ class FrameTimes(ArrayValue):
     def ambient_s(self, start_s: ArrayLike, row: ArrayLike) -> Floats:
         """Return the middle of the exposure of rows, which may be fractions; a row below 0 is the first one."""
         inside = np.clip(np.asarray(row, dtype=float), 0.0, self.rows - 1.0)
-        return np.asarray(start_s) + inside * self.row_s + self.exposure_s / 2.0
+        return np.asarray(np.asarray(start_s) + inside * self.row_s + self.exposure_s / 2.0)
 
     def lit(self, start_s: ArrayLike, row: ArrayLike, light: int) -> Light:
         """Return what rows (n, k) of frames that start at (n,) get of a light; rows may be fractions."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..base.arrays import Bools, Floats, Indices, Ints
+from ..base.arrays import Floats, Indices, Ints
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import stack_stops
@@ -339,8 +339,3 @@ def single_stop(stops: Stop, row: int) -> Stop:
         handed=stops.handed[row],
         contour=stops.contour[row],
     )
-
-
-def missing(values: Floats) -> Bools:
-    """Return which rows (n,) of (n, k) values are NaN."""
-    return ~np.isfinite(values).all(axis=-1)

@@ -36,6 +36,7 @@ _VOLUNTARY = 1.18, 0.0134  # durations of closing over spontaneous ones, and of 
 _PARTIAL = (0.5, 0.9)  # closure of partial blinks
 _DILATES = 3.5  # time constant of dilation over that of constriction
 _FIELD_DEG = 60.0
+_JUMP_STEPS = 50  # of the grid, in which a jump of the rig happens
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +66,7 @@ class MovingEyes:
             InputError: an eye cannot look at a target.
         """
         count = round((sequence.duration_s + 2 * BEFORE_S) / STEP_S) + 2
-        times = STEP_S * np.arange(count) - BEFORE_S
+        times = np.asarray(STEP_S * np.arange(count) - BEFORE_S, dtype=np.float64)
         seed = (sequence.seed & 0xFFFFFFFF, sequence.seed >> 32)
         head = _head(sequence, times, seed)
         turn, shift = _rig(sequence, times, seed)
@@ -171,10 +172,11 @@ def _head(sequence: Sequence, times_s: Floats, seed: tuple[int, ...]) -> Floats:
 def _rig(sequence: Sequence, times_s: Floats, seed: tuple[int, ...]) -> tuple[Floats, Floats]:
     """Return rotation vectors and translations (n, 3) of the rig."""
     nothing = np.zeros((len(times_s), 3))
-    if isinstance(table := sequence.rig, RigTable):
+    table = sequence.rig
+    if isinstance(table, RigTable):
         turn = nothing if table.rotation_rad is None else table.at("rotation_rad", times_s)
         return turn, nothing if table.translation_mm is None else table.at("translation_mm", times_s)
-    return _slippage(sequence.rig, times_s, sequence.duration_s, np.random.default_rng((*seed, 0x511F)))
+    return _slippage(table, times_s, sequence.duration_s, np.random.default_rng((*seed, 0x511F)))
 
 
 def _slippage(
@@ -184,15 +186,13 @@ def _slippage(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     count = int(rng.poisson(model.jumps_per_minute * duration_s / 60.0))
     at = np.sort(rng.uniform(0.0, duration_s, count))
-    jumps = rng.standard_normal((2, count, 3)) * np.array([np.radians(model.jump_deg), model.jump_mm])[:, None, None]
-    # A jump takes 50 ms.
-    steps = np.clip((times_s[:, None] - at) / 0.05, 0.0, 1.0)
-    drift = np.array([np.radians(model.drift_deg_s), model.drift_mm_s])
-    turn, shift = (
-        times_s[:, None] * drift[k] * directions[k] + steps @ jumps[k] if count else times_s[:, None] * drift[k] * directions[k]
-        for k in (0, 1)
-    )  # fmt: skip
-    return np.asarray(turn), np.asarray(shift)
+    jumps = rng.standard_normal((count, 2, 3)) * np.array([np.radians(model.jump_deg), model.jump_mm])[:, None]
+    speed = np.zeros((len(times_s), 2, 3))
+    for first, jump in zip(np.searchsorted(times_s, at).tolist(), jumps, strict=True):
+        speed[first : first + _JUMP_STEPS] += jump / _JUMP_STEPS
+    drift = np.array([np.radians(model.drift_deg_s), model.drift_mm_s])[:, None] * directions
+    moved = times_s[:, None, None] * drift + np.cumsum(speed, axis=0)
+    return moved[:, 0], moved[:, 1]
 
 
 def _blinks(sequence: Sequence, times_s: Floats, habits: Habits, seed: tuple[int, ...]) -> _Blinks:
@@ -252,7 +252,7 @@ def _pupils(
 
 
 def _reflex(model: PupilModel, times_s: Floats, gaze: GazeCourse, habits: Habits) -> Floats:
-    """Return the pupil relative to its rest (n,): it follows light and vergence with a latency and two time constants."""
+    """Return the pupil relative to its rest (n,), which follows light and vergence with a latency."""
     goal = np.ones(len(times_s))
     if model.luminance is not None:
         table = model.luminance

@@ -46,7 +46,7 @@ class GazeCourse:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fixations:
-    """Fixations in order: begin (k,) s, the way of the target (k, 3) mm and its velocity (k, 3) mm/s, pursuit (k,)."""
+    """Fixations in order: begin (k,) s, target (k, 3) mm then, its velocity (k, 3) mm/s, and pursuit (k,)."""
 
     begin_s: Floats
     target_mm: Floats
@@ -80,7 +80,7 @@ def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aim) -
 
 @dataclass(frozen=True, slots=True)
 class Looking:
-    """Who looks: the function that aims an eye, the person's habits, and what moves targets with the rig, if it does."""
+    """Who looks: what aims an eye, the person's habits, and what moves targets with the rig, if it moves."""
 
     aim: Aim
     habits: Habits

@@ -1,16 +1,17 @@
 """Saccades: their duration, the course of their velocity, and the oscillation of the pupil that follows them.
 
-The velocity rises as sin^p(pi/2 t / (s T)) for the share s of the duration T and falls alike in the rest. With p = 1.168
-the peak velocity is 1.65 A / T, whatever s is; the acceleration begins at 0. Sources: durations 2.7 A + 23 ms and the share
-of acceleration, 0.45 up to 10 degrees falling to 0.20 at 50, after Collewijn, Erkelens and Steinman 1988 (J. Physiol. 404,
-157-182; the peak saturates near 500 deg/s).
+The velocity rises as sin^p(pi/2 t / (s T)) for the share s of the duration T and falls alike in the rest. With p =
+1.168 the peak velocity is 1.65 A / T, whatever s is; the acceleration begins at 0. Sources: durations 2.7 A + 23 ms and
+the share of acceleration, 0.45 up to 10 degrees falling to 0.20 at 50, after Collewijn, Erkelens and Steinman 1988
+(J. Physiol. 404, 157-182; the peak saturates near 500 deg/s).
 
 The pupil is a damped oscillator in the eye's frame (Bouzat et al. 2018, Phys. Rev. Lett. 120, 178101):
 
     x'' + 2 z w x' + w^2 x = -g theta''
 
 Its gain g is drawn per person, so that 10 degrees displace the apparent gaze by 0.2 to 1 degree, and falls with the
-amplitude, because measured oscillations do (Hooge et al. 2015, Vision Res. 112, 55-67). Below 10 degrees it is constant.
+root of the amplitude, because measured oscillations fall (Hooge et al. 2015, Vision Res. 112, 55-67). Below 10 degrees
+it is constant (chosen).
 """
 
 from __future__ import annotations

@@ -286,7 +286,7 @@ class Sequence(Spec):
     timestamps: Timestamps | None = Field(default=None, description="times that the cameras store; default: none")
     instants: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] | None = Field(
         default=None,
-        description="the instants whose frames are taken, by their numbers, as in the samples of a dataset; default: all",
+        description="the instants whose frames are taken, by their numbers, as in a dataset's samples; default: all",
     )
 
     def build(self, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
