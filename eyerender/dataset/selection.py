@@ -297,6 +297,11 @@ class ClipSelection:
     n: int
 
     @property
+    def count(self) -> int:
+        """Number of selected samples."""
+        return self.clips.count * self.n
+
+    @property
     def spread(self) -> bool:
         """Whether the first clips of each subject are made in turn."""
         return self.clips.spread

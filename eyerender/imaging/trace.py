@@ -8,26 +8,28 @@ where samples are lost, features are missing; the truth is always there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..analytic.observer import AnalyticObserver
-from ..base.arrays import Bools, Floats
+from ..base.arrays import Bools, Floats, Indices
 from ..base.errors import InputError
 from ..base.status import Status
-from ..region.mesh import LidMargins, lid_margins
+from ..eye.model import EyeModel
+from ..eye.pose import Poses, rigid_motion
+from ..region.contour import inner_margins
 from ..rendering.records.job import globe_of
-from ..scene import Scene
+from ..scene import Frames, Scene
 from ..scene.observation import EYES, MAX_GLINTS, Observations
 from ..scene.spec import MAX_OBSERVATIONS
-from .moments import eye_motion
 from .tracker import Tracker
 
 TRACE_SCHEMA = "eyerender/trace/1"
-_LID_STEP_MM = 0.02  # motion of lids and eye between the times at which the opening is computed
+_EVERY_S, _LID_STEP = 0.004, 0.015  # times between openings of open eyes that are computed, and steps of moving lids
+_COLUMNS = 176  # of the lids' edges
 _POINTS = 12  # of an outline: an ellipse has five numbers, and the image of a round stop is one to a thousandth of a px
 
 
@@ -112,7 +114,7 @@ def sample_sequence(scene: Scene, tracker: Tracker) -> Trace:
         )
     frames = scene.frames_at(np.arange(count) / tracker.rate)
     seen = AnalyticObserver(_POINTS).observe(frames)
-    found = _lids(frames)
+    found = _lids(frames, tracker.rate)
     if tracker.noise_px:
         seen = seen.with_noise(tracker.noise_px, tracker.seed, s2s_over_sd=tracker.noise_type)
     lost = np.random.default_rng((tracker.seed, 0x105E)).random(len(seen)) < tracker.loss
@@ -147,51 +149,79 @@ class Lids(NamedTuple):
     covered: Bools
 
 
-def _lids(frames: Any) -> Lids:
-    """Compute the lids of rows; between rows that hardly differ, they are interpolated."""
+def _lids(frames: Frames, rate: float) -> Lids:
+    """Compute the lids of rows: of open eyes every few ms, of moving lids wherever they have moved notably."""
     n, scene, index = len(frames), frames.scene, frames.index
     opening, spare = np.full(n, np.nan), np.full(n, np.inf)
     if scene.region is None or scene.region.head is not None:
         return Lids(opening, spare < 0.0)
-    state = np.concatenate([10.0 * np.nan_to_num(index.lids), 12.0 * np.stack(
-        [frames.pose.azimuth_rad, frames.pose.elevation_rad], axis=1)], axis=1)  # fmt: skip
+    own = np.nan_to_num(index.lids)
+    moved = (own != own.min(axis=0)).any(axis=1)
+    every = max(1, round(_EVERY_S * rate))
     for camera, eye in sorted(set(zip(index.camera.tolist(), index.eye.tolist(), strict=True))):
         rows = np.flatnonzero((index.camera == camera) & (index.eye == eye))
-        knots = rows[_knots(state[rows])]
-        values = np.array([_opening(frames, int(row)) for row in knots])
-        opening[rows], spare[rows] = (np.interp(rows, knots, values[:, k]) for k in (0, 1))
+        moves = moved[rows]
+        ends = np.flatnonzero(np.diff(moves)).tolist()
+        still = {*range(0, len(rows), every), *ends, *(k + 1 for k in ends), len(rows) - 1}
+        knots = sorted(k for k in still if not moves[k])
+        busy = [k for k in _steps(own[rows]) if moves[k]]
+        places = rows[knots + busy]
+        margins = np.concatenate(
+            [_margins(frames, rows[part], scene) for part in (knots, *([k] for k in busy)) if len(part)]
+        )
+        values = _openings(frames, places, margins)
+        order = np.argsort(places)
+        opening[rows], spare[rows] = (np.interp(rows, places[order], column[order]) for column in values)
     return Lids(opening, spare < 0.0)
 
 
-def _knots(state: Floats) -> Sequence[int]:
-    """Return which rows (k,) of a series of states (k, m), in mm, to compute: both ends of each notable step."""
+def _steps(lids: Floats) -> list[int]:
+    """Return which rows of a series of lids (n, 3) differ notably from the one before."""
     kept = [0]
-    for row in range(1, len(state)):
-        if np.abs(state[row] - state[kept[-1]]).max() > _LID_STEP_MM:
-            kept += [row - 1, row] if row - 1 > kept[-1] else [row]
-    return kept if kept[-1] == len(state) - 1 else [*kept, len(state) - 1]
+    for row in np.flatnonzero((lids > 0.0).any(axis=1)).tolist():
+        if np.abs(lids[row] - lids[kept[-1]]).max() > _LID_STEP or row - kept[-1] > 10:
+            kept.append(row)
+    return kept
 
 
-def _opening(frames: Any, row: int) -> tuple[float, float]:
-    """Return the opening (mm) of one row, and how far the middle of the stop is inside of it (mm)."""
-    M, t = eye_motion(frames, row)
-    eye = frames.scene.eye(EYES[frames.index.eye[row]])
-    anchor = frames.scene.eye_position_mm(EYES[frames.index.eye[row]]) + frames.index.head_mm[row]
-    globe = globe_of(eye, M, t - anchor)
-    margins = lid_margins(frames.scene.region_at(frames.index, row), globe)
-    stop = M @ eye.stop.centre_mm + t - anchor
-    return margins.opening_mm(globe, stop[1]), _inside(margins, globe.mirror * globe.centre, stop)
+def _margins(frames: Frames, rows: Indices, scene: Scene) -> Floats:
+    """Compute the inner edges (k, columns, 3) mm of rows of one eye with the same lids, from the apex at rest."""
+    eye, turn, shift = _posed(frames, rows)
+    region = scene.region_at(frames.index, int(rows[0]))
+    assert region is not None
+    return inner_margins(region, globe_of(eye, np.eye(3), np.zeros(3)), (turn, shift), _COLUMNS)
 
 
-def _inside(margins: LidMargins, centre: Floats, point: Floats) -> float:
-    """Return how far (mm, about) the direction of a point from the globe's centre is from the nearer lid's edge."""
-    heights = []
-    for edge in (margins.upper_margin, margins.lower_margin):
-        along = edge if edge[0, 1] < edge[-1, 1] else edge[::-1]
-        x, z = (np.interp(point[1], along[:, 1], along[:, k]) - centre[k] for k in (0, 2))
-        heights.append(np.arctan2(z, x))
-    own = np.arctan2(point[2] - centre[2], point[0] - centre[0])
-    return float(12.0 * min(heights[0] - own, own - heights[1]))
+def _posed(frames: Frames, rows: Indices) -> tuple[EyeModel, Floats, Floats]:
+    """Return the eye of rows, and its motions (k, 3, 3), (k, 3) mm in the frame of the head."""
+    side, pose = EYES[frames.index.eye[rows[0]]], frames.pose.take(rows)
+    eye = frames.scene.eye(side)
+    turn, shift = rigid_motion(Poses(pose.azimuth_rad, pose.elevation_rad, pose.torsion_rad), eye)
+    drawn_back = frames.index.eye_position_mm[rows] - frames.scene.eye_position_mm(side)
+    return eye, turn, shift + drawn_back
+
+
+def _openings(frames: Frames, rows: Indices, margins: Floats) -> tuple[Floats, Floats]:
+    """Return the openings (k,) mm, and how far (mm, about) the middle of the stop is from the nearer edge."""
+    eye, turn, shift = _posed(frames, rows)
+    centre, stop = (turn @ point + shift for point in (eye.sclera.centre_mm, eye.stop.centre_mm))
+    half = _COLUMNS // 2
+    upper, lower = margins[:, : half + 1], np.concatenate([margins[:, half:], margins[:, :1]], axis=1)
+    angles = [_angle(edge, centre, stop[:, 1]) for edge in (upper, lower)]
+    own = np.arctan2(stop[:, 2] - centre[:, 2], stop[:, 0] - centre[:, 0])
+    radius = np.sqrt(np.maximum(eye.sclera.radius_mm**2 - (stop[:, 1] - centre[:, 1]) ** 2, 0.0))
+    return radius * np.maximum(angles[0] - angles[1], 0.0), radius * np.minimum(angles[0] - own, own - angles[1])
+
+
+def _angle(edge: Floats, centre: Floats, y_mm: Floats) -> Floats:
+    """Return the directions (k,) rad from centres (k, 3) to where edges (k, c, 3) pass y (k,)."""
+    along = edge if edge[0, 0, 1] < edge[0, -1, 1] else edge[:, ::-1]
+    last = np.clip((along[:, :, 1] < y_mm[:, None]).sum(axis=1), 1, along.shape[1] - 1)
+    rows = np.arange(len(edge))
+    a, b = along[rows, last - 1], along[rows, last]
+    share = np.clip((y_mm - a[:, 1]) / (b[:, 1] - a[:, 1]), 0.0, 1.0)
+    point = a + share[:, None] * (b - a) - centre
+    return np.arctan2(point[:, 2], point[:, 0])
 
 
 def _or_none(value: float) -> float | None:

@@ -675,11 +675,11 @@ class Scene:
 
     def region_at(self, index: Index, row: int) -> Region | None:
         """Return the eye region of the eye of one row, with its lids as they are then."""
-        region, lids = self.region, index.lids[row]
+        region, lids = self.region, index.lids[row].tolist()
         if region is None or region.head is not None:
             return region
-        if np.isfinite(lids).all():
-            region = region.model_copy(update=dict(zip(MOVEMENTS, lids.tolist(), strict=True)))
+        moved = {name: value for name, value in zip(MOVEMENTS, lids, strict=True) if np.isfinite(value)}
+        region = region.model_copy(update=moved) if moved else region
         return region.of_side(EYES[index.eye[row]])
 
     def stops_of(self, index: Index) -> Stop | None:
