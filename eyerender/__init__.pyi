@@ -42,6 +42,8 @@ from .imaging.imageobserver import ImageObserver as ImageObserver
 from .imaging.imageobserver import detect as detect
 from .imaging.images import LabelledImage as LabelledImage
 from .imaging.images import render as render
+from .imaging.trace import sample_sequence as sample_sequence
+from .imaging.tracker import Tracker as Tracker
 from .region.anatomy import Region as Region
 from .region.look import Look as Look
 from .report.comparison import write_report as write_report
@@ -59,6 +61,7 @@ from .scene import shipped_scenes as shipped_scenes
 from .scene.observation import Observations as Observations
 from .scene.observer import Observer as Observer
 from .scene.people import Population as Population
+from .scene.sequence.spec import Sequence as Sequence
 from .scene.spec import Eye as Eye
 from .scene.spec import EyeDirection as EyeDirection
 from .scene.spec import SceneSpec as SceneSpec

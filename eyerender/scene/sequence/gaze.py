@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from ...base.arrays import Bools, Floats, Ints
 from .habits import Habits
@@ -22,6 +23,7 @@ STEP_S, BEFORE_S = 1e-3, 0.5
 _KNOTS_S = 0.05  # between the times at which a moving eye is aimed
 _CORRELATED_S = 0.02  # of the velocity of drift
 _MICRO_DEG = (0.1, 0.3, 1.0)  # least, median and largest microsaccade
+_AWAY_S = 0.15  # from the beginning of a fixation to its first microsaccade
 _RINGS_S, _FADED = 0.1, 0.1  # longest oscillation after a saccade that is called so, and its least share of the peak
 
 
@@ -100,17 +102,16 @@ def model_course(
     if looking.carried is not None:
         target = looking.carried(target)
     moving = bool(np.ptp(head_mm, axis=0).any() or fixations.pursued.any() or looking.carried is not None)
+    small, in_small = _microsaccades(model, times_s, fixations, habits, rng)
     wanted = _aimed_at(target, head_mm, times_s, aim, None if moving else number)
-    angles, ends_s, sizes = _with_saccades(wanted, number, times_s, fixations, habits)
+    wanted = wanted + _drift(model, number, habits, rng) + small[:, None]
+    whole, ends_s, sizes = _with_saccades(wanted, number, times_s, fixations, habits)
     in_saccade = times_s < ends_s[number]
-    still = _drift(model, times_s, number, in_saccade, habits, rng)
-    small, in_small = _microsaccades(model, times_s, number, ends_s, habits, rng)
     shift, rings = np.zeros((len(times_s), 2, 2)), np.zeros(len(times_s), dtype=bool)
     if model.oscillation:
-        drive = _drive(angles, number, sizes, habits)
+        drive = _drive(whole, number, sizes, habits)
         shift = oscillation_mm(drive, STEP_S, habits.oscillation_hz, habits.oscillation_damping)
         rings = _ringing(shift, number, in_saccade, ends_s, times_s)
-    whole = angles + still + small[:, None]
     pursuit = fixations.pursued[number] & ~in_saccade
     return GazeCourse(
         azimuth_rad=whole[:, :, 0],
@@ -199,60 +200,42 @@ def _with_saccades(
     return wanted - left[:, None, None] * jump[number], ends, size
 
 
-def _drift(
-    model: GazeModel, times_s: Floats, number: Ints, in_saccade: Bools, habits: Habits, rng: np.random.Generator
-) -> Floats:
-    """Return the drift (n, 2 eyes, 2) rad since the last saccade, which restores the gaze.
+def _drift(model: GazeModel, number: Ints, habits: Habits, rng: np.random.Generator) -> Floats:
+    """Return the drift (n, 2 eyes, 2) rad since the beginning of each fixation, whose saccade restores the gaze.
 
     Its velocity is an Ornstein-Uhlenbeck process, whose integral diffuses by 2 D t along each axis.
     """
-    from scipy.signal import lfilter
-
     kept = np.exp(-STEP_S / _CORRELATED_S)
     size = np.radians(np.sqrt(model.drift_arcmin2_s * habits.drift / _CORRELATED_S) / 60.0)
-    white = rng.standard_normal((len(times_s), 2, 2))
+    white = rng.standard_normal((len(number), 2, 2))
     velocity = size * np.sqrt(1 - kept**2) * lfilter([1.0], [1.0, -kept], white, axis=0)
-    way = np.cumsum(np.where(in_saccade[:, None, None], 0.0, velocity), axis=0) * STEP_S
-    # What has been lost until a saccade begins is restored in its course.
-    begin = np.searchsorted(number, np.arange(number[-1] + 1))
-    lost = way[np.maximum(begin - 1, 0)]
-    before = np.concatenate([np.zeros((1, 2, 2)), lost[:-1]])
-    ends = np.array([np.count_nonzero(in_saccade[number == k]) for k in range(len(begin))])
-    since = np.arange(len(times_s)) - begin[number]
-    share = np.where(ends[number] > 0, progress(since / np.maximum(ends[number], 1), 0.45), 1.0)[:, None, None]
-    base = before[number] + share * (lost - before)[number]
-    return np.asarray(way - base)
+    way = np.cumsum(velocity, axis=0) * STEP_S
+    first = np.searchsorted(number, np.arange(number[-1] + 1))
+    return np.asarray(way - way[first][number])
 
 
 def _microsaccades(
-    model: GazeModel, times_s: Floats, number: Ints, ends_s: Floats, habits: Habits, rng: np.random.Generator
+    model: GazeModel, times_s: Floats, fixations: _Fixations, habits: Habits, rng: np.random.Generator
 ) -> tuple[Floats, Bools]:
     """Return microsaccades: displacements (n, 2) rad, which the next saccade ends, and when they happen (n,)."""
     out, happens = np.zeros((len(times_s), 2)), np.zeros(len(times_s), dtype=bool)
     low, median, high = _MICRO_DEG
-    begins = np.append(np.searchsorted(number, np.arange(number[-1] + 1)), len(times_s))
-    for k in range(len(begins) - 1):
-        free = times_s[begins[k]], times_s[begins[k + 1] - 1]
-        start = max(float(ends_s[k]) + 0.05, float(free[0]))
-        room = float(free[1]) - 0.08 - start
+    edges = np.append(fixations.begin_s, times_s[-1] + STEP_S)
+    places = np.searchsorted(times_s, edges)
+    for k in range(len(fixations.begin_s)):
+        # They keep away from the saccades at both ends.
+        start, room = edges[k] + _AWAY_S, edges[k + 1] - edges[k] - 1.5 * _AWAY_S
         count = int(rng.poisson(model.microsaccades_per_s * max(room, 0.0)))
-        offset = np.zeros(2)
+        inside, offset = slice(places[k], places[k + 1]), np.zeros(2)
         for at in np.sort(start + room * rng.random(count)).tolist():
             size = float(np.clip(median * np.exp(0.5 * rng.standard_normal()), low, high))
             heading = rng.uniform(0.0, 2 * np.pi)
             goal = np.radians(size) * np.array([np.cos(heading), np.sin(heading)])
             lasting = float(duration_s(np.array(size))) * habits.duration
-            inside = slice(begins[k], begins[k + 1])
             part = progress((times_s[inside] - at) / lasting, 0.45)
             out[inside] += part[:, None] * (goal - offset)
             offset = goal
             happens[inside] |= (part > 0.0) & (part < 1.0)
-        # The next saccade leads back to its target.
-        if count and k + 2 < len(begins):
-            after = slice(begins[k + 1], begins[k + 2])
-            lasting = max(float(ends_s[k + 1] - times_s[begins[k + 1]]), STEP_S)
-            part = progress((times_s[after] - times_s[begins[k + 1]]) / lasting, 0.45)
-            out[after] += (1.0 - part)[:, None] * offset
     return out, happens
 
 
