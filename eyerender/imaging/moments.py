@@ -92,6 +92,7 @@ def _in_sequence(
     if len(counts) == 1 and counts[0] == 1 and on.all():
         return ()
     parts, labelled = [], _Labelled(timing.seen([start], rows[None], lights).time_s[0], start, edges, counts)
+    moves = sum(counts) > len(counts)
     for k, count in enumerate(counts):
         if not on[k].any() and not _is_lit_otherwise(middle):
             continue
@@ -102,7 +103,9 @@ def _in_sequence(
             dimmed = tuple(
                 lamp if lit else replace(lamp, intensity_mw_sr=0.0) for lamp, lit in zip(job.lights, on[k], strict=True)
             )
-            seed = int(np.random.SeedSequence([middle.seed, k, n]).generate_state(1, np.uint64)[0])
+            seed = middle.seed
+            if moves:
+                seed = int(np.random.SeedSequence([middle.seed, k, n]).generate_state(1, np.uint64)[0])
             jobs.append(replace(job, lights=dimmed, seed=seed, labels=False))
         shares = timing.shares(inner, rows)
         if timing.is_rolling:

@@ -86,6 +86,9 @@ class Renderer:
         """Trace a job, or the sub-frames of its exposure; take labels and glints from mid-exposure."""
         parts = moments or (SubFrames(jobs=(job,)),)
         shots = [(shot, part) for part in parts for shot in part.jobs]
+        # The light that moments share is that of the middle, from which they differ least.
+        middle = len(shots) // 2
+        shots = [shots[k] for k in sorted(range(len(shots)), key=lambda k: abs(k - middle))]
         spp = max(1, (spp or self.spp) // _shots_of_a_row(parts))
         blur: Blur | None = None
         pictures: dict[int, list[Singles]] = {id(part): [] for part in parts}
@@ -101,7 +104,7 @@ class Renderer:
             lit.setdefault(lamps, bound.frame)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
             means = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
-            if shot is shots[len(shots) // 2][0]:
+            if shot is shots[0][0]:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job, surroundings) if _is_middle(shot, job) else None

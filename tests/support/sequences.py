@@ -29,7 +29,7 @@ def in_time(
 
 def turning(speed_deg_s: float, start_deg: float = 0.0, duration_s: float = 0.1, **keys: Any) -> dict[str, Any]:
     """Return a sequence whose eyes turn to the left at a constant speed, and do nothing else."""
-    ends = [-0.5, duration_s + 0.5]
+    ends = [-0.05, duration_s + 0.05]
     gaze = {
         "time_s": ends,
         "azimuth_deg": [start_deg + speed_deg_s * t for t in ends],
