@@ -15,7 +15,7 @@ from ...population.pupil import watson_yellott_mm
 from .gaze import BEFORE_S, STEP_S, Carrier, GazeCourse, Looking, model_course, table_course
 from .habits import Habits
 from .spec import (
-    Aim,
+    Aiming,
     GazeTable,
     HeadTable,
     LidModel,
@@ -59,7 +59,7 @@ class MovingEyes:
         )
 
     @classmethod
-    def of(cls, sequence: Sequence, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
+    def of(cls, sequence: Sequence, aim: Aiming, habits: Habits, resting_mm: Floats) -> MovingEyes:
         """Make a sequence's courses on the grid.
 
         Raises:

@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from ...base.arrays import Bools, Floats, Ints
 from .habits import Habits
 from .saccades import acceleration_share, duration_s, fallen_gain, oscillation_mm, progress
-from .spec import Aim, GazeModel, GazeTable
+from .spec import Aiming, GazeModel, GazeTable
 
 STEP_S, BEFORE_S = 1e-3, 0.5
 """Step of the grid, and how long before and after a sequence it reaches."""
@@ -56,7 +56,7 @@ class _Fixations:
     pursued: Bools
 
 
-def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aim) -> GazeCourse:
+def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aiming) -> GazeCourse:
     """Return the gaze of a user's table on a grid."""
     n = len(times_s)
     target = np.full((n, 3), np.nan)
@@ -84,7 +84,7 @@ def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aim) -
 class Looking:
     """Who looks: what aims an eye, the person's habits, and what moves targets with the rig, if it moves."""
 
-    aim: Aim
+    aim: Aiming
     habits: Habits
     carried: Carrier | None = None
 
@@ -157,7 +157,7 @@ def _without_repeats(size: int, count: int, rng: np.random.Generator) -> Ints:
     return np.asarray(np.cumsum(steps) % size)
 
 
-def _aimed_at(target_mm: Floats, head_mm: Floats, times_s: Floats, aim: Aim, number: Ints | None = None) -> Floats:
+def _aimed_at(target_mm: Floats, head_mm: Floats, times_s: Floats, aim: Aiming, number: Ints | None = None) -> Floats:
     """Return the angles (n, 2 eyes, 2) of eyes that look at targets (n, 3) with the head at (n, 3).
 
     With `number` (n,), targets stand still, and each number is aimed at once; else the eyes are aimed every 50 ms.

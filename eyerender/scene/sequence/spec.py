@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -12,14 +12,10 @@ from ...base.arrays import Floats, Ints
 from ...base.spec import NonNegative, Number, Positive, Spec, Vec2, Vec3
 from ...rig.screen import ScreenPlane
 
-if TYPE_CHECKING:
-    from .course import MovingEyes
-    from .habits import Habits
-
-Share = Annotated[float, Field(ge=0, le=1)]
+Closure = Annotated[float, Field(ge=0, le=1)]
 Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=20_000)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
-Aim = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
+Aiming = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
 """Turns an eye (0 right, 1 left) towards targets (k, 3) mm with the head at (k, 3) mm: azimuth and elevation, rad."""
 
 
@@ -105,7 +101,7 @@ class GazeModel(Spec):
     microsaccades_per_s: Annotated[float, Field(ge=0, le=5)] = Field(
         default=1.0, description="rate of microsaccades, 0.1 to 1 degree (1 to 2 per second)"
     )
-    pursuit_share: Share = Field(default=0.0, description="share of the fixations whose target moves")
+    pursuit_share: Closure = Field(default=0.0, description="share of the fixations whose target moves")
     pursuit_deg_s: Annotated[float, Field(ge=0, le=40)] = Field(default=10.0, description="speed of these targets")
     oscillation: bool = Field(default=True, description="whether the pupil oscillates in the eye after saccades")
     torsion_deg: Angle = Field(default=0.0, description="torsion, added to that of Listing's law")
@@ -134,9 +130,9 @@ class GazeModel(Spec):
 class LidTable(_Table):
     """The user's own lids."""
 
-    blink: tuple[Share, ...] = Field(description="closure of the lids, 0 to 1")
-    squint: tuple[Share, ...] | None = Field(default=None, description="lower lid raised")
-    wide: tuple[Share, ...] | None = Field(default=None, description="upper lid raised above its rest")
+    blink: tuple[Closure, ...] = Field(description="closure of the lids, 0 to 1")
+    squint: tuple[Closure, ...] | None = Field(default=None, description="lower lid raised")
+    wide: tuple[Closure, ...] | None = Field(default=None, description="upper lid raised above its rest")
 
 
 class LidModel(Spec):
@@ -147,7 +143,7 @@ class LidModel(Spec):
         description="mean rate of spontaneous blinks; intervals are log-normal (19.8 +- 4.9 watching a film; 10.3 +- "
         "3.1 fixating, Doughty 2002, Optom. Vis. Sci. 79)",
     )
-    complete_share: Share = Field(
+    complete_share: Closure = Field(
         default=0.47, description="share of blinks that shut the eye (52.9 % of 1,414 are partial, Ousler et al. 2014)"
     )
     at_s: tuple[NonNegative, ...] = Field(default=(), description="voluntary, complete blinks begin at these times")
@@ -288,18 +284,3 @@ class Sequence(Spec):
         default=None,
         description="the instants whose frames are taken, by their numbers, as in a dataset's samples; default: all",
     )
-
-    def build(self, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
-        """Make all that is drawn and solved once.
-
-        Args:
-            aim: turns an eye towards targets.
-            habits: those of the person.
-            resting_mm: (2,) diameters of the stops, right and left.
-
-        Raises:
-            InputError: an eye cannot look at a target.
-        """
-        from .course import MovingEyes
-
-        return MovingEyes.of(self, aim, habits, resting_mm)
