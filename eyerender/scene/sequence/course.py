@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ...base.arrays import Floats, Statuses
 from ...eye.pose import listing_torsion
 from ...population.pupil import watson_yellott_mm
-from .gaze import BEFORE_S, STEP_S, Carrier, GazeCourse, Looking, model_course, table_course
+from .gaze import BEFORE_S, STEP_S, GazeCourse, Looking, model_course, table_course
 from .habits import Habits
 from .spec import (
     Aiming,
@@ -139,7 +140,7 @@ class MovingEyes:
         return np.repeat(closure[:, None], 2, axis=1), nothing, nothing
 
 
-def _carried(turn_rad: Floats, shift_mm: Floats) -> Carrier | None:
+def _carried(turn_rad: Floats, shift_mm: Floats) -> Callable[[Floats], Floats] | None:
     """Return what moves targets with the rig; None if it is still."""
     if not (turn_rad.any() or shift_mm.any()):
         return None

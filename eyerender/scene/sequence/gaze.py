@@ -27,10 +27,6 @@ _AWAY_S = 0.15  # from the beginning of a fixation to its first microsaccade
 _RINGS_S, _FADED = 0.1, 0.1  # longest oscillation after a saccade that is called so, and its least share of the peak
 
 
-Carrier = Callable[[Floats], Floats]
-"""Moves targets (n, 3) mm on the grid with the rig."""
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GazeCourse:
     """Gaze on the grid: angles (n, 2) rad, shift of the stop (n, 2, 2) mm, targets (n, 3) mm, and events (n,)."""
@@ -86,7 +82,7 @@ class Looking:
 
     aim: Aiming
     habits: Habits
-    carried: Carrier | None = None
+    carried: Callable[[Floats], Floats] | None = None
 
 
 def model_course(
