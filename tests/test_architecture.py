@@ -246,10 +246,10 @@ BOUNDS = {
     "base": 2710,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
     "dataset": 11360,  # codes as cameras stored them, labels with validity, augmentation; clear mistakes, for trainers
-    "design": 3780,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on; derivatives in one batch, for makers of rigs
+    "design": 3780,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 6500,
-    "eye": 4610,  # spectacle lenses, their frames, legs of rays, for the same; eyes and schemas from biometry, for laboratories
-    "folders": 1880,  # compressed depth, normals, lens reflections, for those who train; what damaged videos and lost lines lack
+    "eye": 4610,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
+    "folders": 1880,  # compressed depth, normals, lens reflections, for those who train; what damaged folders lack
     "gaze": 5420,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 2440,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
     "optics": 5450,
