@@ -104,12 +104,12 @@ def rigs() -> dict[str, er.Rig]:
 
 
 def recording(
-    rig: er.Rig, preset: str, subject: int, seed: int, grid_deg: list[tuple[float, float]] = GRID_DEG
+    rig: er.Rig, preset: str, subject: int, seed: int, session: int = 0
 ) -> tuple[er.Observations, EyeModel, np.ndarray, er.Scene]:
-    """Features of a person's right eye, the true eye, its lines of sight (i, 3), and the scene."""
+    """Features of a person's right eye in a session, the true eye, its lines of sight (i, 3), and the scene."""
     person = er.Population(preset=preset).person(subject, seed)
-    rng = np.random.default_rng([seed, subject, PRESETS.index(preset)])
-    ways = direction_of(*np.radians(np.array(grid_deg, dtype=float)).T)
+    rng = np.random.default_rng([seed, subject, PRESETS.index(preset), *([session] if session else [])])
+    ways = direction_of(*np.radians(np.array(GRID_DEG, dtype=float)).T)
     slips = SLIPPAGE_MM * rng.standard_normal(ways.shape)
     misses = np.radians(FIXATION_DEG) * rng.standard_normal((len(ways), 2))
     told = PLACE_MM + 1000.0 * ways
@@ -262,7 +262,8 @@ def people_rows(report: Report, rig: str, what: str, given: list[Outcome | None]
 def cost_rows(report: Report) -> None:
     """CPU time and memory of 1,000 over 250 frames, of the estimator and of the fit of an eye."""
     rig = rigs()["headset, one camera"]
-    seen, _, _, scene = recording(rig, "adults", 0, TUNED)
+    sessions = [recording(rig, "adults", 0, TUNED, session) for session in range(20)]  # each with its own noise
+    seen, scene = concatenate([one[0] for one in sessions]), sessions[0][3]
     calibrated = er.gaze.MaximumLikelihood().fit(seen, scene.rig)
     used: dict[str, list[tuple[float, float]]] = {"predict": [], "fit_eye": []}
     for count in (250, 1000):
