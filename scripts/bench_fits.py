@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Bench of fits of eyes to people: do their 95 % intervals cover, and are their stated deviations those achieved?
 
-    bench_fits.py [--quick] [--json F] [--people N] [--seed S]
+    bench_fits.py [--quick] [--json F] [--people N] [--seed S] [--priors]
 
 Drawn people of every preset look at 13 targets a metre away, in front of four rigs. Outlines, glints and fixations have
 the noise that the fit is told, and in every frame the eye is displaced by the slippage of the priors, which no record
@@ -9,6 +9,9 @@ states. Fits start from the default eye and priors, with the targets and without
 pooled for each rig. A rectangle of two 95 % intervals, or the ellipse of a gaze, covers what it should in 95 %.
 
 Last come the costs of many frames, as the ratio of 1,000 to 250 frames.
+
+With --priors, the rows are the deviations of the default priors over the rms differences of other people from the
+default eye; no eye is fitted.
 """
 
 from __future__ import annotations
@@ -55,6 +58,7 @@ from eyerender.design.unknowns import (
 )
 from eyerender.design.varied import radius_of, stacked_eyes, tangents, varied_eyes
 from eyerender.eye.batch import take_eyes
+from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.optics.surfaces_biconic import Biconic
@@ -100,12 +104,12 @@ def rigs() -> dict[str, er.Rig]:
 
 
 def recording(
-    rig: er.Rig, preset: str, subject: int, seed: int, grid_deg: list[tuple[float, float]] = GRID_DEG
+    rig: er.Rig, preset: str, subject: int, seed: int, session: int = 0
 ) -> tuple[er.Observations, EyeModel, np.ndarray, er.Scene]:
-    """Features of a person's right eye, the true eye, its lines of sight (i, 3), and the scene."""
+    """Features of a person's right eye in a session, the true eye, its lines of sight (i, 3), and the scene."""
     person = er.Population(preset=preset).person(subject, seed)
-    rng = np.random.default_rng([seed, subject, PRESETS.index(preset)])
-    ways = direction_of(*np.radians(np.array(grid_deg, dtype=float)).T)
+    rng = np.random.default_rng([seed, subject, PRESETS.index(preset), *([session] if session else [])])
+    ways = direction_of(*np.radians(np.array(GRID_DEG, dtype=float)).T)
     slips = SLIPPAGE_MM * rng.standard_normal(ways.shape)
     misses = np.radians(FIXATION_DEG) * rng.standard_normal((len(ways), 2))
     told = PLACE_MM + 1000.0 * ways
@@ -258,7 +262,8 @@ def people_rows(report: Report, rig: str, what: str, given: list[Outcome | None]
 def cost_rows(report: Report) -> None:
     """CPU time and memory of 1,000 over 250 frames, of the estimator and of the fit of an eye."""
     rig = rigs()["headset, one camera"]
-    seen, _, _, scene = recording(rig, "adults", 0, TUNED)
+    sessions = [recording(rig, "adults", 0, TUNED, session) for session in range(20)]  # each with its own noise
+    seen, scene = concatenate([one[0] for one in sessions]), sessions[0][3]
     calibrated = er.gaze.MaximumLikelihood().fit(seen, scene.rig)
     used: dict[str, list[tuple[float, float]]] = {"predict": [], "fit_eye": []}
     for count in (250, 1000):
@@ -282,13 +287,33 @@ def cost_rows(report: Report) -> None:
         report.add(row(f"{name}: memory of 1,000 over 250 frames", lots[1] / few[1], "ratio", 5.0))
 
 
+def prior_rows(report: Report, count: int) -> None:
+    """Compare the default priors with people of all presets; the pupil's harmonics have wider ones, by 1.5."""
+    prior, rig = load_eye("adult").build(eye="right"), rigs()["headset, one camera"]
+    found = []
+    for k, preset in enumerate(PRESETS):
+        for number in range(count):
+            person = er.Population(preset=preset).person(number, TUNED + k)
+            own = er.Subject.of(person, eyes=("right",), luminance_cd_m2=20.0)
+            scene = er.Scene(own, rig, targets=er.Targets.at(PLACE_MM + np.array([[1000.0, 0.0, 0.0]])))
+            found.append(numbers_of(scene.eye("right"), prior)[LOCAL:])
+    rms = np.sqrt(np.mean(np.array(found) ** 2, axis=0))
+    for name, value, stated in zip(PERSON, rms, er.Unknowns.population().deviations()[LOCAL:], strict=True):
+        if np.isfinite(value):
+            report.add(row(f"{name}: prior over rms of {len(found)} people", stated / value, "ratio"))
+
+
 def main() -> int:
     """Fit everybody and print the rows."""
     parser: argparse.ArgumentParser = options_of(__doc__, "take two people of each preset, and no costs")
     parser.add_argument("--people", type=int, default=20, help="people of each preset (20)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the people (1)")
+    parser.add_argument("--priors", action="store_true", help="compare the default priors with people")
     options = parser.parse_args()
     report, count = Report(), 2 if options.quick else options.people
+    if options.priors:
+        prior_rows(report, count)
+        return report.finish(options.json, ("eyerender", "numpy", "scipy"))
     for name, rig in rigs().items():
         outcomes = [
             fitted(rig, preset, count * k + number, options.seed)

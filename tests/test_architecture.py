@@ -245,15 +245,15 @@ BOUNDS = {
     "backends": 990,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2710,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2720,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 11670,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
-    "design": 3770,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
+    "dataset": 11680,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
+    "design": 3780,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 6500,
-    "eye": 4650,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
-    "folders": 1870,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
+    "eye": 4670,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
+    "folders": 1880,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5430,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 3100,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
     "optics": 5450,
-    "population": 2590,
+    "population": 2610,  # children who become more myopic as they grow, for trackers of children
     "region": 4080,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
     "rendering": 13110,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
     "report": 990,

@@ -226,6 +226,9 @@ def test_a_wrong_line_is_named_when_it_is_read(folder, keys, words):
         ("[]", "line 2: must be a JSON object"),
         ("", "line 2: must be a JSON object"),
         ('"\udcff"', "line 2: is not valid JSON: not UTF-8"),
+        ('{"a": [1,', "line 2: is not valid JSON: ends too early; the file may have been cut off"),
+        ('{"a": "b', "line 2: is not valid JSON: ends too early"),
+        ('{"a" 1}', "line 2: is not valid JSON: Expecting ':' delimiter"),
     ],
 )
 def test_hostile_lines_are_one_error(folder, text, words):

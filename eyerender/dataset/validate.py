@@ -55,8 +55,10 @@ def validate(
 
     Raises:
         BackendError: no backend can render.
-        InputError: the path is not a folder of images.
+        InputError: the path is not a folder of images, or `render` is negative.
     """
+    if render < 0:
+        raise InputError(f"must be >= 0, not {render}", path="render")
     path = Path(path)
     folder = ImageFolder.load(path)
     step = progress or (lambda *_: None)
@@ -66,24 +68,20 @@ def validate(
         problems.extend(verify_dataset(path, quick=quick, progress=step))
         compare_lines(folder, problems)
     total = len(folder.entries)
-    rows = range(total) if deep else sampled(total, str(folder.dataset.get("digest")), SAMPLE)
     able = truth is not None and truth.stale is None
-    recomputed = len(rows) if able else 0
-    chosen = frozenset(rows if able and not deep else ())
+    rows = range(total) if deep else frozenset(sampled(total, str(folder.dataset.get("digest")), SAMPLE))
+    read = recomputed = 0
     lines = Lines(folder, truth)
     for start, batch in _batches(folder.entries, problems):
         records = check_records([entry.line for entry in batch])
         for k, (entry, wrong) in enumerate(zip(batch, records, strict=True), start):
             where = f"{entry.source.relative_to(path).as_posix()} line {entry.number}"
             named = str(entry.line["file_name"])
-            used = truth if able and (deep or k in chosen) else None
+            used = truth if able and k in rows else None
+            read, recomputed = read + 1, recomputed + (used is not None)
             try:
                 problems.extend(f"{where}: {text}" for text in lines.take(k, entry))
-                problems.extend(f"{named}: {text}" for text in wrong)
-                if not wrong:
-                    problems.extend(f"{named}: {text}" for text in _check(entry, used, tally, quick=quick))
-                elif quick:
-                    _find_files(entry)
+                problems.extend(f"{named}: {text}" for text in _check(entry, wrong, used, tally, quick=quick))
             except WRONG as error:
                 problems.add(f"{where}: lacks expected labels ({type(error).__name__}: {error})")
             except InputError as error:
@@ -100,7 +98,7 @@ def validate(
         "schema": "eyerender/validation/1",
         "path": str(path),
         "ok": not problems.count,
-        "images": total,
+        "images": read,
         "recomputed": recomputed,
         "notes": notes,
         "problem_count": problems.count,
@@ -122,13 +120,18 @@ def _truth(folder: ImageFolder, problems: FolderProblems, notes: list[str]) -> D
     return found
 
 
-def _check(entry: ImageEntry, truth: DatasetTruth | SceneTruth | None, tally: Tally, *, quick: bool) -> Iterator[str]:
-    """Describe what is wrong with an image and its metadata; with `truth` None, nothing is recomputed."""
-    again = Again(()) if truth is None else truth.again(entry.line)
-    yield from again.problems
+def _check(
+    entry: ImageEntry, wrong: list[str], truth: DatasetTruth | SceneTruth | None, tally: Tally, *, quick: bool
+) -> Iterator[str]:
+    """Describe what is wrong with an image and its metadata; with `truth` None, nothing is recomputed.
+
+    If its records are `wrong`, no more is compared with them.
+    """
+    again = Again(()) if truth is None or wrong else truth.again(entry.line)
+    yield from (*wrong, *again.problems)
     if quick:
         _find_files(entry)
-    else:
+    elif not wrong:
         yield from check_images(entry, again.limbus_px, tally)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from ..base.arrays import ArrayValue, Bools, Floats, Ints
 from ..base.status import Status
@@ -19,6 +20,7 @@ from .noise import FeatureNoise
 from .unknowns import COUNT
 from .varied import FeatureSlopes, ModelFeatures
 
+Complexes = npt.NDArray[np.complex128]
 ELLIPSE_POINTS, MOST_POINTS = 24, 40
 MODEL_PX = 0.02
 """Deviation that is added to the covariances of an extractor (chosen): they hold the sensor's noise alone, often less
@@ -225,29 +227,34 @@ def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floa
     count = model_px.shape[1]
     waves = np.arange((count - 1) // 2 + 1)
 
-    def harmonics(values: Floats) -> Floats:
+    def harmonics(values: Floats) -> Complexes:
         found = np.fft.rfft(values, axis=1)[:, : len(waves)] / count
         found[:, 1:] *= 2.0
         return np.asarray(found)
 
+    def turns(f: Floats) -> Complexes:
+        """Compute exp(i w f) for all waves w, (n, k, waves)."""
+        out = np.ones((*f.shape, len(waves)), dtype=np.complex128)
+        out[..., 1:] = np.exp(1j * f)[..., None]
+        return np.asarray(np.cumprod(out, axis=-1))
+
     parts = harmonics(model_px)
-    gaps = np.linalg.norm(observed_px[:, :, None] - model_px[:, None], axis=-1)
-    f = 2.0 * np.pi / count * np.argmin(gaps, axis=2)
-    first, second = 1j * waves[:, None] * parts, -(waves[:, None] ** 2) * parts
+    gap_x, gap_y = (observed_px[:, :, None, i] - model_px[:, None, :, i] for i in (0, 1))
+    f = 2.0 * np.pi / count * np.argmin(gap_x**2 + gap_y**2, axis=2)
+    derivatives = np.concatenate([parts, 1j * waves[:, None] * parts, -(waves[:, None] ** 2) * parts], axis=2)
     for _ in range(_NEWTON):
-        wave = np.exp(1j * f[..., None] * waves)
-        point, along, bend = ((wave @ c).real for c in (parts, first, second))
+        point, along, bend = np.split((turns(f) @ derivatives).real, 3, axis=2)
         gap = point - observed_px
         square = np.sum(along**2, axis=-1)
         slope = square + np.sum(gap * bend, axis=-1)
         step = np.sum(gap * along, axis=-1) / np.where(slope > 0.2 * square, slope, square)
         f = f - np.clip(step, -0.3, 0.3)
-    wave = np.exp(1j * f[..., None] * waves)
-    point, along = (wave @ parts).real, (wave @ first).real
+    wave = turns(f)
+    point, along, _ = np.split((wave @ derivatives).real, 3, axis=2)
     normal = np.stack([along[..., 1], -along[..., 0]], axis=-1) / np.linalg.norm(along, axis=-1)[..., None]
     distance = np.sum(normal * (observed_px - point), axis=-1)
     if slopes is None:
         return distance, None
     by = harmonics(slopes.reshape(*model_px.shape[:2], -1))
-    moved = (wave @ by).real.reshape(*f.shape, 2, -1)
-    return distance, -np.einsum("nkx,nkxa->nka", normal, moved)
+    real = np.concatenate([wave.real, -wave.imag], axis=2) @ np.concatenate([by.real, by.imag], axis=1)
+    return distance, -np.einsum("nkx,nkxa->nka", normal, real.reshape(*f.shape, 2, -1))

@@ -59,7 +59,7 @@ MOST_CHI2, MOST_DEVIATIONS = 2.0, 5.0
 """Largest chi^2 per degree of freedom without a warning, and distance from a prior's mean without a refusal."""
 _PUPIL_MM = (0.5, 9.5)
 _FIRST_SCALE = 1000.0
-_MOST_RAD, _STUCK, _RELATIVE, _TINY = 0.25, 1e12, 1e-10, 1e-16
+_MOST_RAD, _MOST_STEP, _STUCK, _RELATIVE, _TINY = 0.25, 2.0, 1e12, 1e-10, 1e-16
 DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX = 0.1, 0.05
 
 
@@ -665,9 +665,15 @@ def unexplained(problem: Problem, theta: Floats) -> Floats:
 
 
 def _limited(problem: Problem, step: Floats) -> Floats:
-    """Shorten steps (i, 35) that would turn a direction by more than `_MOST_RAD`."""
+    """Shorten steps (i, 35) that would turn a direction by `_MOST_RAD`, or change a person by `_MOST_STEP` deviations.
+
+    The first steps of a person would lead to eyes that cannot exist; their rays take minutes to trace.
+    """
     share = np.minimum(1.0, _MOST_RAD / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-12))
-    return np.asarray(step * (share.min() if problem.shared else share[:, None]))
+    if not problem.shared:
+        return np.asarray(step * share[:, None])
+    person = np.abs(step[0, LOCAL:]) * np.sqrt(problem.precision[LOCAL:])
+    return np.asarray(step * min(share.min(), _MOST_STEP / max(person.max(), 1e-12)))
 
 
 def _improves(problem: Problem, now: tuple[Floats, Residuals], trial: Floats, weights: Weights) -> tuple[Bools, Bools]:

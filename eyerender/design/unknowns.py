@@ -116,7 +116,7 @@ class Unknowns(Spec):
             "corneal_radius_mm": 0.28,
             "asphericity": 0.12,
             "pupil_depth_mm": 0.42,
-            "kappa_deg": 1.45,
+            "kappa_deg": 1.3,
             "rotation_depth_mm": 0.65,
             "toricity_mm": 0.053,
             "pupil_centre_mm": 0.12,

@@ -7,14 +7,14 @@ pupil's shift with its size acts like a shift of its centre.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..analytic.features import View
 from ..analytic.rays import glint_exits, pupil_exits
-from ..base.arrays import Bools, Floats, Ints, Statuses
+from ..base.arrays import Bools, Floats, Ints, Statuses, take_rows
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import slices, stack_eyes, structure_of, take_eyes
@@ -216,7 +216,7 @@ def _outline_moves(stop: Stop, theta: Floats, count: int) -> Floats:
     the image like one that the pupil's centre carries along, so that these derivatives need no traces.
     """
     varied = _varied_stop(stop, theta)
-    angle = np.broadcast_to(2.0 * np.pi * np.arange(count) / count, (len(theta), count))
+    angle = (2.0 * np.pi * np.arange(count) / count)[None]
     radius = varied.relative_radius(angle)
     y = ((stop.handed * varied.semi_axes_mm[:, 0])[:, None] * np.cos(angle) * radius)[..., None]
     z = (varied.semi_axes_mm[:, 1, None] * np.sin(angle) * radius)[..., None]
@@ -250,12 +250,14 @@ def varied_eyes(eye: EyeModel, theta: Floats) -> EyeModel:
     first = _flattened(_scaled(eye.front[0], factor), theta[:, ASPHERICITY])
     front = [_toric(first, theta[:, TORICITY], eye.stop.handed)]
     front += [_toric(_scaled(s, behind), theta[:, POSTERIOR_TORICITY], eye.stop.handed) for s in eye.front[1:]]
-    return replace(eye, front=tuple(front), stop=_varied_stop(eye.stop, theta), rotation=_varied_centres(eye, theta))
+    return replace(
+        eye, front=tuple(front), stop=_varied_stop(eye.stop, theta), rotation=_varied_centres(eye.rotation, theta)
+    )
 
 
-def _varied_centres(eye: EyeModel, theta: Floats) -> RotationCentres:
+def _varied_centres(turns: RotationCentres, theta: Floats) -> RotationCentres:
     """Apply the unknowns of the rotation centres."""
-    turns, back = eye.rotation, np.array([1.0, 0.0, 0.0])
+    back = np.array([1.0, 0.0, 0.0])
     azimuth, elevation = theta[:, ROTATION] + theta[:, GAP] / 2.0, theta[:, ROTATION] - theta[:, GAP] / 2.0
     return RotationCentres(
         turns.azimuth_centre_mm - azimuth[:, None] * back,
@@ -318,7 +320,7 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
     shifts = np.zeros((1 + 2 * count, COUNT))
     shifts[1 : 1 + count, traced_columns] = np.diag(steps)
     shifts[1 + count :, traced_columns] = -np.diag(steps)
-    stop = take_eyes(views.eyes, views.person).stop
+    stop = take_rows(views.eyes.stop, views.person)
     widening = _widening(stop, theta)
     every = np.tile(np.arange(n), len(shifts))
     all_theta = (theta[None] + shifts[:, None]).reshape(-1, COUNT)
@@ -357,20 +359,15 @@ def slopes_of(views: Views, theta: Floats, boundary_points: int, free: Bools | N
 
 def lines_of_sight(views: Views, theta: Floats) -> tuple[Floats, Floats]:
     """Compute lines of sight in the world: points (n, 3) mm where they leave the cornea, and unit directions (n, 3)."""
-    return _lines_of(take_eyes(views.eyes, views.person), views, theta)
-
-
-def _lines_of(eye: EyeModel, views: Views, theta: Floats) -> tuple[Floats, Floats]:
-    """Compute `lines_of_sight` with the eye of each view, which is slow to select."""
-    handed = eye.stop.handed
-    way = eye.chief_ray.direction
+    eyes, who = views.eyes, views.person
+    handed, way = eyes.stop.handed[who], eyes.chief_ray.direction[who]
     nasal = np.arctan2(handed * way[:, 1], way[:, 0]) + theta[:, KAPPA][:, 0]
     up = np.arctan2(way[:, 2], way[:, 0]) + theta[:, KAPPA][:, 1]
     inside = normalize(np.stack([np.ones_like(up), handed * np.tan(nasal), np.tan(up)], axis=-1))
-    turned = replace(eye, rotation=_varied_centres(eye, theta))
+    turned = replace(eyes, rotation=_varied_centres(take_rows(eyes.rotation, who), theta))
     turn, shift = rigid_motion(Poses.listing(theta[:, AZIMUTH], theta[:, ELEVATION]), turned)
     place = views.position_mm + theta[:, SLIPPAGE] + theta[:, POSITION]
-    point = np.einsum("nij,nj->ni", turn, eye.chief_ray.point_mm) + shift + place
+    point = np.einsum("nij,nj->ni", turn, eyes.chief_ray.point_mm[who]) + shift + place
     return point, np.asarray(np.einsum("nij,nj->ni", turn, inside))
 
 
@@ -382,36 +379,34 @@ def tangents(direction: Floats) -> Floats:
 
 def gaze_slopes(views: Views, theta: Floats) -> Floats:
     """Compute derivatives (n, 2, 35) of the line of sight's direction, left and up (rad), by the unknowns."""
-    eye = take_eyes(views.eyes, views.person)
-    across = tangents(_lines_of(eye, views, theta)[1])
-    columns = [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1]
-    return _differences(theta, columns, lambda t: np.einsum("nci,ni->nc", across, _lines_of(eye, views, t)[1]))
+    across = tangents(lines_of_sight(views, theta)[1])
+
+    def shifts(rows: Ints, varied: Floats) -> Floats:
+        return np.asarray(np.einsum("nci,ni->nc", across[rows], lines_of_sight(views.take(rows), varied)[1]))
+
+    return _differences(theta, [AZIMUTH, ELEVATION, KAPPA.start, KAPPA.start + 1], shifts)
 
 
 def target_misses(views: Views, theta: Floats, target_mm: Floats) -> Floats:
     """Compute angles (n, 2) in rad, left and up, from the direction of targets (n, 3) to the line of sight."""
-    return _misses(lines_of_sight(views, theta), target_mm)
-
-
-def _misses(lines: tuple[Floats, Floats], target_mm: Floats) -> Floats:
-    """Compute the angles (n, 2) of `target_misses` from lines of sight."""
-    point, way = lines
+    point, way = lines_of_sight(views, theta)
     return np.asarray(np.einsum("nci,ni->nc", tangents(normalize(target_mm - point)), way))
 
 
 def target_slopes(views: Views, theta: Floats, target_mm: Floats) -> Floats:
     """Compute derivatives (n, 2, 35) of `target_misses` by the unknowns."""
     columns = [c for c in range(TORICITY.start) if c not in (PUPIL, RADIUS, ASPHERICITY, DEPTH)] + [GAP]
-    eye = take_eyes(views.eyes, views.person)
-    return _differences(theta, columns, lambda t: _misses(_lines_of(eye, views, t), target_mm))
+    return _differences(theta, columns, lambda rows, varied: target_misses(views.take(rows), varied, target_mm[rows]))
 
 
-def _differences(theta: Floats, columns: Sequence[int], function: object) -> Floats:
-    """Compute central differences (n, 2, 35) of a function of the unknowns with values (n, 2)."""
-    assert callable(function)
-    out = np.zeros((len(theta), 2, COUNT))
-    for column in columns:
-        step = np.zeros(COUNT)
-        step[column] = _RAY_STEP
-        out[..., column] = (function(theta + step) - function(theta - step)) / (2.0 * _RAY_STEP)
+def _differences(theta: Floats, columns: Sequence[int], function: Callable[[Ints, Floats], Floats]) -> Floats:
+    """Compute central differences (n, 2, 35) of a function of rows (m,) and their unknowns, with values (m, 2)."""
+    n, count = len(theta), len(columns)
+    steps = np.zeros((2, count, 1, COUNT))
+    steps[0, np.arange(count), 0, columns] = _RAY_STEP
+    steps[1] = -steps[0]
+    varied = (theta + steps).reshape(-1, COUNT)
+    after, before = function(np.tile(np.arange(n), 2 * count), varied).reshape(2, count, n, 2)
+    out = np.zeros((n, 2, COUNT))
+    out[..., columns] = np.moveaxis(after - before, 0, -1) / (2.0 * _RAY_STEP)
     return out

@@ -29,7 +29,8 @@ KERATOMETRIC_MM_D = 337.5
 ROOT_GAP_MM, LIMBUS_GAP_MM = 0.1, 0.35
 _DEEPER_PER_MM = 0.5
 _ADULT = Path(__file__).parent / "catalogue" / "adult.yaml"
-_MEASURED = ("cornea", "lens", "retina", "limbus_radius_mm", "toric_axis")
+MEASURED = ("cornea", "lens", "retina", "limbus_radius_mm", "toric_axis")
+"""Keys of an eye file that follow from `biometry`."""
 
 Keratometry = Annotated[float, Field(ge=20.0, le=80.0)]
 
@@ -81,7 +82,7 @@ def with_biometry(data: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: a number does not fit, or stands beside a key that follows from it.
     """
-    for key in _MEASURED:
+    for key in MEASURED:
         if key in data:
             raise InputError("cannot stand beside 'biometry', from which it follows", path=key)
     try:

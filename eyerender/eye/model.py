@@ -66,7 +66,7 @@ class Stop(ArrayValue):
         f runs from the first semi-axis of the right eye's stop towards up; for a left eye it is mirrored.
 
         Args:
-            angle_rad: () or (m,); (n, ...) for a batch of n stops.
+            angle_rad: () or (m,); (n, ...) for a batch of n stops, (1, ...) if all have the same.
         """
         angle = np.asarray(angle_rad, dtype=np.float64)
         out = np.ones(angle.shape)
@@ -86,7 +86,7 @@ class Stop(ArrayValue):
         first = (self.handed * self.semi_axes_mm[..., 0])[..., None] * np.cos(angle)
         second = self.semi_axes_mm[..., 1, None] * np.sin(angle)
         if self.contour.shape[-1]:
-            radius = self.relative_radius(np.broadcast_to(angle, first.shape))
+            radius = self.relative_radius(angle.reshape((1,) * (first.ndim - 1) + (-1,)))
             first, second = first * radius, second * radius
         r, c = self.rotation[..., None, :, :], self.centre_mm[..., None, :]
         return np.asarray(c + first[..., None] * r[..., :, 1] + second[..., None] * r[..., :, 2])

@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from ..base.spec import ByKind, FileSpec, Number, Positive, Spec, Vec2, Vec3
+from .biometry import BiometrySpec
 
 # This is the number of surfaces of the finest lens of shells.
 MAX_SURFACES = 400
@@ -322,6 +323,10 @@ class EyeParts(FileSpec):
     format: int = Field(default=FORMAT, description="version of this file format")
     name: str = Field(description="name of the model")
     description: str = Field(default="", description="description of the model, in a sentence")
+    biometry: BiometrySpec | None = Field(
+        default=None,
+        description="numbers of a biometer in place of the keys that follow from them; all other keys may be left out",
+    )
     cornea: tuple[SurfaceSpec, ...] = Field(
         min_length=1, max_length=MAX_SURFACES, description="surfaces between air and the stop"
     )

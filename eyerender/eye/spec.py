@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from ..base.errors import InputError
 from ..base.spec import KeyProblem, Side
-from .biometry import with_biometry
+from .biometry import MEASURED, with_biometry
 from .build import build_eye
 from .check import check_eye
 from .model import EyeModel
@@ -34,6 +34,14 @@ class EyeSpec(EyeParts):
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
         """Replace the numbers of a biometer by the keys that follow from them."""
         return with_biometry(data) if "biometry" in data else data
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """Return the JSON Schema, in which a file has either all required keys or `biometry`."""
+        schema = super().json_schema()
+        from_biometer = {"required": ["biometry"], "not": {"anyOf": [{"required": [key]} for key in MEASURED]}}
+        whole = {"required": schema.pop("required"), "not": {"required": ["biometry"]}}
+        return {**schema, "oneOf": [whole, from_biometer]}
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -371,9 +371,10 @@ class ImageFolder:
             return cls._of_run(folder)
         packed = (folder / INDEX).exists() and (folder / DATASET).exists()
         if not packed and not (folder / METADATA).exists():
-            raise InputError(
-                f"holds no {METADATA}, so it is not a folder of images written by this package", source=str(path)
-            )
+            why = "so it is not a folder of images written by this package"
+            if (folder / SHARDS).is_dir() and (folder / DATASET).is_file():
+                why = "which is lost; generate with the same spec makes it again, and with it all pictures"
+            raise InputError(f"holds no {METADATA}, {why}", source=str(path))
         schema, source = PACKED_SCHEMA if packed else DATASET_SCHEMA, str(folder / DATASET)
         dataset = read_json(folder / DATASET, limit=MAX_DONE_BYTES, follow=False)
         if dataset.get("schema") != schema:

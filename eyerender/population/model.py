@@ -18,7 +18,7 @@ formula).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -74,12 +74,18 @@ class Reference:
         np.fill_diagonal(between, [table.quantities[name].eyes for name in eye])
         whole = np.eye(subjects + 2 * len(eye))
         whole[subjects:, subjects:] = np.block([[inside, between], [between.T, inside]])
-        age = [name for name, q in table.quantities.items() if q.of == "subject"].index("age_years")
-        for k in (subjects, subjects + len(eye)):
-            whole[age, k + eye.index("refraction_d")] = whole[k + eye.index("refraction_d"), age] = table.age_r
+        _join_age(whole, table)
         nearest = nearest_correlation(whole)
         distance = float(np.linalg.norm(nearest - whole))
         return cls(table=table, distributions=found, correlation=asked, latent=nearest, distance=distance)
+
+    def with_age_r(self, r: float) -> Reference:
+        """Replace the latent correlation of age and refraction; residuals and their correlations stay."""
+        refraction = self.table.quantities["refraction_d"].model_copy(update={"age_r": r})
+        table = self.table.model_copy(update={"quantities": {**self.table.quantities, "refraction_d": refraction}})
+        latent = np.array(self.latent)
+        _join_age(latent, table)
+        return replace(self, table=table, latent=nearest_correlation(latent))
 
 
 @dataclass(frozen=True)
@@ -193,6 +199,22 @@ class Model:
 def default_reference() -> Reference:
     """Return the reference population of the package's table; solved once."""
     return Reference.of(default_table())
+
+
+@cache
+def reference_of(preset: str) -> Reference:
+    """Return the reference population with the preset's own correlation of age and refraction."""
+    reference = default_reference()
+    own = reference.table.presets[preset].age_r
+    return reference if own is None else reference.with_age_r(own)
+
+
+def _join_age(latent: Floats, table: PopulationTable) -> None:
+    """Write the correlation of age with the refraction of both eyes into latent correlations, in place."""
+    subject, eye = ([name for name, q in table.quantities.items() if q.of == of] for of in ("subject", "eye"))
+    age, first = subject.index("age_years"), len(subject) + eye.index("refraction_d")
+    for column in (first, first + len(eye)):
+        latent[age, column] = latent[column, age] = table.age_r
 
 
 def _marginal(quantity: Quantity) -> Distribution:

@@ -24,7 +24,7 @@ from . import correction
 from .draw import Conditions, latent_numbers
 from .eyes import amplitude_d, eye_file
 from .marginals import Fixed
-from .model import Model, default_reference
+from .model import Model, reference_of
 from .pupil import watson_yellott_mm
 from .refraction import Biometry, Optics, solve
 from .table import ROOTS, Distribution, PopulationTable, QuantityRegression, default_table
@@ -75,7 +75,7 @@ class PopulationSpec(Spec):
     @cached_property
     def model(self) -> Model:
         """Joint distribution of this population."""
-        reference = default_reference()
+        reference = reference_of(self.preset)
         preset = reference.table.presets[self.preset]
         return Model(reference, {**reference.distributions, **preset.replace, **self.replace})
 

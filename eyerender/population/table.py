@@ -100,6 +100,7 @@ class Preset(Spec):
 
     description: str = Field(description="description of the people")
     replace: dict[str, Distribution] = Field(default_factory=dict, description="quantity -> its distribution")
+    age_r: Correlation | None = Field(default=None, description="replaces `age_r` of `refraction_d`")
     sources: tuple[Source, ...] = Field(default=(), description="where the numbers come from")
 
 

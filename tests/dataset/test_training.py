@@ -244,6 +244,7 @@ def test_the_same_key_gives_the_same_picture_and_limits_are_checked():
     wrong: tuple[tuple[str, Any], ...] = (
         ("flip", 1.1),
         ("scale", (0, 1)),
+        ("scale", (0.001, 0.001)),
         ("gamma", (2.0, 1.0)),
         ("noise", (0.0, np.nan)),
         ("seed", -1),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from eyerender.analytic.observer import trace
+from eyerender.apps.inspection import inspect
 from eyerender.base.errors import InputError, UnfinishedRunWarning
 from eyerender.cli.main import run
 from eyerender.dataset.export import export
@@ -142,6 +143,27 @@ def test_damage_of_an_unfinished_run_is_found(copy, tmp_path):
     assert any("pose.azimuth_deg: missing" in problem for problem in found)
     with pytest.warns(UnfinishedRunWarning), pytest.raises(InputError, match=r"shards/00001/lines\.jsonl: has"):
         export(copy, "csv", tmp_path / "out")
+
+
+def test_lines_that_cannot_be_read_are_not_counted_as_read(copy):
+    path = copy / "metadata.jsonl"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:5], lines[5][:200], *lines[6:]]) + "\n")
+    report = validate(copy, quick=True)
+    assert (report["images"], report["recomputed"]) == (23, 23)
+    assert any("line 6: is not valid JSON: ends too early" in problem for problem in report["problems"])
+    assert inspect(copy)["datasets"][0]["images_read"] == 23
+
+
+def test_a_negative_number_of_images_is_refused(tiny):
+    with pytest.raises(InputError, match="render: must be >= 0, not -2"):
+        validate(tiny, render=-2)
+
+
+def test_lost_lines_say_what_makes_them_again(copy):
+    (copy / "metadata.jsonl").unlink()
+    with pytest.raises(InputError, match=r"holds no metadata.jsonl, which is lost; generate with the same spec makes"):
+        validate(copy)
 
 
 def test_what_is_no_dataset_is_refused(copy, tmp_path):

@@ -88,9 +88,8 @@ def test_a_toric_eye_file_is_mirrored_unless_it_says_otherwise(tmp_path):
 def test_the_file_of_a_fitted_left_eye_is_that_of_the_left_eye():
     """From exact features and from its own eye, a fit finds no change, so that the file has the same left eye."""
     eye = er.Eye(biometry=NUMBERS)
-    frames = er.Subject(eye, eyes=["left"]).fixating(
-        [[1000, 31.5, 0], [1000, 131.5, 80]], er.load_scene("headset").spec.rig
-    )
+    rig = er.load_scene("desktop_tracker").spec.rig
+    frames = er.Subject(eye, eyes=["left"]).fixating([[620, 31.5, 0], [620, 131.5, 80]], rig)
     (fit,) = er.fit_eye(er.trace(frames), frames.scene.rig, prior=eye.spec())
     assert keratometry(er.Eye(fit.spec), "left")[1][0] == pytest.approx(20, abs=0.5)
 

@@ -217,3 +217,24 @@ def test_stacked_stops_keep_their_margins():
 def test_the_json_schema_names_every_key():
     schema = EyeSpec.json_schema()
     assert set(EyeSpec.model_fields) == set(schema["properties"])
+
+
+def test_the_json_schema_takes_either_all_keys_or_the_numbers_of_a_biometer():
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(EyeSpec.json_schema())
+    numbers = {
+        "k1_d": 42.5,
+        "k1_axis_deg": 20,
+        "k2_d": 44.25,
+        "acd_mm": 3.3,
+        "lens_mm": 3.9,
+        "axial_mm": 24,
+        "wtw_mm": 12,
+    }
+    short = {"format": 3, "biometry": numbers}
+    whole = load_eye("E4").to_mapping()
+    assert EyeSpec.from_mapping(short).biometry is None  # the keys that follow stand in its place
+    assert validator.is_valid(short)
+    assert validator.is_valid(whole)
+    for bad in ({"format": 3}, {**whole, "biometry": numbers}, {"biometry": {**numbers, "acd_mm": 0.5}}):
+        assert not validator.is_valid(bad)

@@ -120,7 +120,7 @@ def test_a_rendered_scene_is_a_folder_too(spec, tmp_path):
 def test_splits_of_a_folder_share_no_subject(folder):
     subjects = {}
     for split, count in (("train", 10), ("validation", 5), ("test", 5)):
-        data = FolderDataset(folder, split=split, parts=())
+        data = FolderDataset(folder, split=split, parts=("eye",))
         assert len(data) == count
         subjects[split] = {data[k]["subject"] for k in range(count)}
     assert [len(s) for s in subjects.values()] == [2, 1, 1]
@@ -164,7 +164,7 @@ def test_a_stream_equals_what_generate_writes(folder, spec, workers, batch_size,
 
 def test_a_split_of_a_stream_is_that_of_the_folder(folder, spec):
     for split in ("train", "validation", "test"):
-        own = FolderDataset(folder, split=split, parts=())
+        own = FolderDataset(folder, split=split, parts=("eye",))
         stream = StreamDataset(spec, split=split, parts=("image",), batch_size=3)
         assert numbers(stream) == [own[k]["sample"] for k in range(len(own))]
 
@@ -231,7 +231,7 @@ def test_every_batch_has_one_place():
 
 def test_ranks_and_workers_make_every_sample_once(spec):
     def batches(workers, **options):
-        stream = StreamDataset(spec, batch_size=3, parts=(), **options)
+        stream = StreamDataset(spec, batch_size=3, parts=("eye",), **options)
         return [batch["sample"].tolist() for batch in stream.loader(workers)]
 
     whole = batches(0, lanes=4)
@@ -252,7 +252,7 @@ from eyerender.torch import StreamDataset
 from tests.support.dataset_specs import plan
 rank, place = int(sys.argv[1]), sys.argv[2]
 dist.init_process_group("gloo", init_method=f"file://{place}", rank=rank, world_size=2)
-stream = StreamDataset(plan(count=6, subjects=2), batch_size=2, parts=())
+stream = StreamDataset(plan(count=6, subjects=2), batch_size=2, parts=("eye",))
 print(stream.rank, stream.ranks, [int(i) for batch in stream for i in batch["sample"]])
 dist.barrier()
 dist.destroy_process_group()
@@ -296,10 +296,10 @@ def test_each_worker_goes_on_in_its_own_batches(spec, monkeypatch):
         id, num_workers = 1, 2
 
     monkeypatch.setattr("eyerender.torch.get_worker_info", Worker)
-    own = [batch["sample"].tolist() for batch in StreamDataset(spec, batch_size=3, parts=(), start=1)]
-    stream = StreamDataset(spec, batch_size=3, parts=(), start=1)
+    own = [batch["sample"].tolist() for batch in StreamDataset(spec, batch_size=3, parts=("eye",), start=1)]
+    stream = StreamDataset(spec, batch_size=3, parts=("eye",), start=1)
     assert next(iter(stream))["sample"].tolist() == own[0]
-    resumed = StreamDataset(spec, batch_size=3, parts=(), start=1)
+    resumed = StreamDataset(spec, batch_size=3, parts=("eye",), start=1)
     resumed.load_state_dict(stream.state_dict())
     assert [batch["sample"].tolist() for batch in resumed] == own[1:]
 
@@ -325,7 +325,11 @@ def test_bad_arguments_are_one_line(folder, spec, tmp_path):
             "no image is of the split 'val'; there are test, train, validation",
         ),
         (lambda: FolderDataset(folder, parts=("colour",)), "parts: must be some of image, noiseless, mask"),
-        (lambda: FolderDataset(folder, parts=("amodal_mask",))[0], "line 1: has no part 'amodal_mask'"),
+        (lambda: FolderDataset(folder, parts=()), "parts: is empty; name some of image, noiseless"),
+        (
+            lambda: FolderDataset(folder, parts=("amodal_mask",))[0],
+            "line 1: has no part 'amodal_mask': its line names no 'amodal_masks'",
+        ),
         (lambda: StreamDataset("no_such_spec"), "no such dataset file"),
         (lambda: StreamDataset(spec, batch_size=0), "batch_size: must be >= 1, not 0"),
         (lambda: StreamDataset(spec, start=-1), "start: must be >= 0, not -1"),

@@ -95,7 +95,7 @@ def test_a_group_holds_all_cameras_of_an_instant(pair):
 
 def test_a_stream_mixes_the_images_of_several_batches(spec):
     def batches(**options):
-        stream = StreamDataset(spec, batch_size=4, parts=(), **options)
+        stream = StreamDataset(spec, batch_size=4, parts=("eye",), **options)
         return [batch["sample"].tolist() for batch in stream]
 
     plain, mixed = batches(lanes=5), batches(shuffle=5)
@@ -105,14 +105,14 @@ def test_a_stream_mixes_the_images_of_several_batches(spec):
     assert np.mean(subjects) > 2 > np.mean([len({k // 5 for k in batch}) for batch in plain])
     assert batches(shuffle=5) == mixed
     assert batches(shuffle=5, start=3) == mixed[3:]  # renders the window again
-    stream = StreamDataset(spec, batch_size=4, parts=(), shuffle=3)
+    stream = StreamDataset(spec, batch_size=4, parts=("eye",), shuffle=3)
     parts = iter(stream)
     begun = [next(parts)["sample"].tolist() for _ in range(2)]
-    resumed = StreamDataset(spec, batch_size=4, parts=(), shuffle=3)
+    resumed = StreamDataset(spec, batch_size=4, parts=("eye",), shuffle=3)
     resumed.load_state_dict(stream.state_dict())
     assert begun + [batch["sample"].tolist() for batch in resumed] == batches(shuffle=3)
     with pytest.raises(InputError, match="shuffle: is 3 in the state, but 0 here"):
-        StreamDataset(spec, batch_size=4, parts=()).load_state_dict(stream.state_dict())
+        StreamDataset(spec, batch_size=4, parts=("eye",)).load_state_dict(stream.state_dict())
 
 
 def test_pictures_have_the_codes_of_their_camera(tmp_path):

@@ -78,7 +78,7 @@ class Inspection:
         return {
             "path": str(c.folder.path),
             "images": len(c.folder.entries),
-            "images_read": len(c),
+            "images_read": sum(map(bool, c.names)),
             "unfinished": bool(c.folder.unfinished),
             "splits": {name: {"images": n, "subjects": len(own)} for name, (n, own) in self.splits.items()},
             "subjects_in_two_splits": {str(subject): names for subject, names in self.shared.items()},

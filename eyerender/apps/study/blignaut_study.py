@@ -18,7 +18,7 @@ from .figures import clouds_figure, lines_figure
 from .findings import SETS
 from .guestrin_study import departures_of
 from .page_parts import ABOUT_READINGS, Apart, cards_of, rows_section
-from .results import Erratum, Finding, ModelResults, Row
+from .results import Erratum, Finding, ModelResults, Row, keys_of
 from .study import Study, StudyJob
 from .waterfall import waterfall
 
@@ -81,7 +81,7 @@ class BlignautStudy(Study):
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
         """Test the paper's sentences on errors and feature clouds."""
         found: list[Finding] = []
-        for protocol, observer in _keys(parts):
+        for protocol, observer in keys_of(parts):
             here = [p for p in parts if (protocol, observer) in p.done]
             done = {p.eye_model: list(p.done[protocol, observer].values()) for p in here}
             clouds = {p.eye_model: p.more["clouds"][protocol, observer] for p in here}
@@ -152,10 +152,6 @@ class BlignautStudy(Study):
         ]
 
 
-def _keys(parts: Sequence[ModelResults]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys(key for part in parts for key in part.done))
-
-
 def _best_means(done: list[blignaut.FunctionErrors]) -> dict[str, float | None]:
     """Compute the mean error of the best function for each set."""
     found = {c: blignaut.best(done, c) for c in SETS}
@@ -169,14 +165,14 @@ def _best_by_key(parts: Sequence[ModelResults]) -> dict[tuple[str, str], dict[st
             p.eye_model: [np.nan if v is None else v for v in _best_means(list(p.done[key].values())).values()]
             for p in parts if key in p.done
         }
-        for key in _keys(parts)
+        for key in keys_of(parts)
     }  # fmt: skip
 
 
 def _clouds(parts: Sequence[ModelResults]) -> list[Figure]:
     """Draw the clouds of pupils and glints that each observer sees."""
     # One reading of the scene suffices for the clouds: the corrected one if available.
-    keys = [k for k in _keys(parts) if k[0] == "corrected"] or _keys(parts)
+    keys = [k for k in keys_of(parts) if k[0] == "corrected"] or keys_of(parts)
     # The sensor's noise is invisible at this scale.
     keys = [k for k in keys if k[1] != "image-noiseless" or (k[0], "image") not in keys]
     return [

@@ -28,7 +28,7 @@ from ...gaze.regression import Regression
 from ...scene import Scene
 from ...scene.observation import EYES, WHITE, Observations
 from . import blignaut, guestrin
-from .literature import CALIBRATION_SETS
+from .literature import CALIBRATION_SETS, texts
 from .results import ModelResults, Row, mean_row
 from .study import changed, name_of, of_person
 
@@ -48,34 +48,11 @@ CENTRES: dict[str, dict[str, Any]] = {FIXED: {}, SHIFTED: {"margin": {}}}
 QUALITY = ("accuracy_deg", "rms_s2s_deg", "sd_deg", "s2s_over_sd")
 
 
-def _with_lens(axis: int) -> str:
-    """Return the paths of the positions of the stop and, if there is one, the lens.
+PARAMETERS = tuple((row["parameter"], row["paths"], float(row["step"]), row["unit"]) for row in texts("parameters"))
+"""Label, paths in the eye file (`_eye_with`), step and unit; each is changed by plus and minus one step.
 
-    Both move together, so that the lens does not cross the stop.
-    """
-    stop, where = f"stop.position_mm.{axis}", f"position_mm.{axis}"
-    surfaces = f"{stop}&lens.surfaces.0.{where}&lens.surfaces.1.{where}"
-    return f"{surfaces}|{stop}&lens.front.{where}&lens.back.{where}|{stop}"
-
-
-# Label, path in the eye file, step, unit. Each parameter is changed by plus and minus one step.
-PARAMETERS: tuple[tuple[str, str, float, str], ...] = (
-    ("corneal radius", "cornea.0.shape.radius_mm|cornea.0.shape.radii_mm", 0.1, "mm"),
-    ("corneal asphericity Q", "cornea.0.shape.conic_constant|cornea.0.shape.conic_constants", 0.05, ""),
-    ("index behind the cornea", "cornea.0.medium.index|cornea.0.medium.cauchy.0", 0.005, ""),
-    ("cornea moved nasally", "cornea.0.position_mm.1", 0.1, "mm"),
-    ("cornea moved up", "cornea.0.position_mm.2", 0.1, "mm"),
-    ("cornea tilted about y", "cornea.0.tilt_deg.1", 1.0, "deg"),
-    ("cornea tilted about z", "cornea.0.tilt_deg.2", 1.0, "deg"),
-    ("posterior corneal radius", "cornea.1.shape.radius_mm", 0.1, "mm"),
-    ("corneal thickness", "cornea.1.position_mm.0", -0.05, "mm"),
-    ("pupil and lens moved back", _with_lens(0), -0.1, "mm"),
-    ("pupil and lens moved nasally", _with_lens(1), 0.1, "mm"),
-    ("pupil and lens moved up", _with_lens(2), 0.1, "mm"),
-    ("centres of rotation moved back", "rotation.azimuth_centre_mm.0&rotation.elevation_centre_mm.0", -0.5, "mm"),
-    ("fovea, horizontal angle", "fovea.field_deg.0", 0.5, "deg"),
-    ("fovea, vertical angle", "fovea.field_deg.1", 0.5, "deg"),
-)
+The lens moves with the stop, so that it does not cross it.
+"""
 
 
 @dataclass(slots=True, kw_only=True)

@@ -12,6 +12,7 @@ from ...analytic.observer import trace
 from ...base.arrays import Floats
 from ...base.errors import InputError
 from ...gaze.budget import mean_interval
+from ...gaze.parameters import NAMES
 from ...report.page import Card, Figure, Section, table_of
 from ...scene import Scene
 from ...scene.observation import Observations
@@ -19,7 +20,7 @@ from . import findings, guestrin
 from . import literature as lit
 from .figures import heads_figure
 from .page_parts import ABOUT_READINGS, Apart, cards_of, rows_section
-from .results import Erratum, Finding, ModelResults, Row
+from .results import Erratum, Finding, ModelResults, Row, keys_of
 from .study import Study, StudyJob, StudyPlan
 from .waterfall import waterfall
 
@@ -98,7 +99,7 @@ class GuestrinStudy(Study):
 
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
         """Test the paper's sentences on the means of each reading and observer."""
-        return [one for key in _keys(parts) for one in findings.guestrin(*_means(parts, key), *key)]
+        return [one for key in keys_of(parts) for one in findings.guestrin(*_means(parts, key), *key)]
 
     def errata(self, parts: Sequence[ModelResults]) -> Sequence[Erratum]:
         """Return the misprints, with what those that were tried change."""
@@ -117,7 +118,7 @@ class GuestrinStudy(Study):
     def cards(self, parts: Sequence[ModelResults], apart: Apart) -> list[Card]:
         """Return the means by eye model; the published variants of E5 are in the section's text and table."""
         cells = {}
-        for key in _keys(parts):
+        for key in keys_of(parts):
             means = _means(parts, key)[0]
             some = {m: v for m, v in means.items() if m not in lit.VARIANTS or len(means) == 1}
             cells[key] = {m: f"{v['H1']:.2f}/{v['H2']:.2f}" for m, v in some.items()}
@@ -175,10 +176,6 @@ def _misprint(eye: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     return {**done.means, **counts}
 
 
-def _keys(parts: Sequence[ModelResults]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys(key for part in parts for key in part.done))
-
-
 def _means(
     parts: Sequence[ModelResults], key: tuple[str, str]
 ) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, Floats]]]:
@@ -197,7 +194,7 @@ def _means(
 def _tests(parts: Sequence[ModelResults]) -> list[dict[str, Any]]:
     return [
         {"protocol": key[0], "observer": key[1], **test}
-        for key in _keys(parts)
+        for key in keys_of(parts)
         for test in findings.t_tests(_means(parts, key)[0])
     ]
 
@@ -228,7 +225,8 @@ def _heads_figure(parts: Sequence[ModelResults]) -> Figure | None:
     """Draw Figure 4 of the paper; None if every error is too large for it."""
     # A variant with errors above 11 deg would flatten the other curves.
     shown = {
-        ", ".join(key): {m: v for m, v in _means(parts, key)[0].items() if max(v.values()) < 3} for key in _keys(parts)
+        ", ".join(key): {m: v for m, v in _means(parts, key)[0].items() if max(v.values()) < 3}
+        for key in keys_of(parts)
     }
     own = {label: means for label, means in shown.items() if means}
     if not own:
@@ -248,15 +246,12 @@ def _h1(c: Mapping[str, Any]) -> str:
     return f"{spread['min']:.4f} to {spread['max']:.4f}"
 
 
+_PARAMETERS = dict(zip(("R (mm)", "K (mm)", "n", "alpha (deg)", "beta (deg)"), NAMES, strict=True))
 _CALIBRATION: dict[str, Any] = {
     "protocol": "protocol",
     "variant": "variant",
     "eye model": "eye_model",
-    "R (mm)": lambda c: c["calibration"]["parameters"]["cornea_radius_mm"],
-    "K (mm)": lambda c: c["calibration"]["parameters"]["pupil_distance_mm"],
-    "n": lambda c: c["calibration"]["parameters"]["index"],
-    "alpha (deg)": lambda c: c["calibration"]["parameters"]["alpha_deg"],
-    "beta (deg)": lambda c: c["calibration"]["parameters"]["beta_deg"],
+    **{told: lambda c, name=name: c["calibration"]["parameters"][name] for told, name in _PARAMETERS.items()},
     "at a bound": lambda c: ", ".join(c["calibration"]["at_bound"]) or None,
     "H1 (deg)": "h1_mean_deg",
     "H1 over the starts": _h1,

@@ -33,45 +33,27 @@ PAPER_GUESTRIN: Final = MappingProxyType(
 )
 PAPER_GUESTRIN_E5: Final = 11.0
 
-CALIBRATION_SETS: Final = MappingProxyType(
-    {
-        # Targets are counted from 1: 9 * column + row + 1, columns from y = +247.5 mm to -247.5 mm, rows from the top.
-        "C5": (1, 9, 68, 127, 135),
-        "C9": (1, 5, 9, 64, 68, 72, 127, 131, 135),
-        "C14": (3, 9, 19, 25, 39, 45, 64, 70, 93, 99, 109, 115, 129, 135),
-        "C18": (1, 9, 14, 20, 26, 39, 43, 58, 64, 72, 78, 93, 97, 110, 116, 122, 127, 135),
-        "C23": (1, 5, 9, 12, 16, 28, 32, 36, 48, 52, 64, 68, 72, 84, 88, 100, 104, 108, 120, 124, 127, 131, 135),
-        "C135": tuple(range(1, 136)),
-    }
-)
-
-# [29]: mean errors (deg) of 26 participants, by function, for the sets in their order.
-BLIGNAUT_DEG: Final = MappingProxyType(
-    {
-        "R1": (1.40, 1.29, 1.15, 1.16, 1.14, 1.11),
-        "R2": (1.37, 1.09, 0.96, 0.94, 0.94, 0.90),
-        "R3": (2.94, 0.91, 0.76, 0.75, 0.73, 0.68),
-        "R4": (4.93, 0.87, 0.72, 0.70, 0.68, 0.64),
-        "R5": (1.50, 1.09, 0.95, 0.96, 0.94, 0.90),
-        "R6": (1.72, 0.93, 0.84, 0.83, 0.81, 0.78),
-        "R7": (3.43, 0.80, 0.62, 0.62, 0.60, 0.56),
-        "R8": (6.17, 2.06, 0.58, 0.56, 0.53, 0.48),
-        "R9": (6.24, 2.09, 0.62, 0.59, 0.57, 0.53),
-        "R10": (7.76, 4.74, 0.70, 0.67, 0.62, 0.55),
-        "R11": (7.32, 3.07, 0.62, 0.60, 0.57, 0.52),
-        "R12": (8.74, 5.53, 0.70, 0.67, 0.62, 0.54),
-    }
-)
-# The paper's Table 5: the function that it names as the best in [29].
-PAPER_BEST: Final = MappingProxyType({"C5": "R2", "C9": "R5", "C14": "R8", "C18": "R8", "C23": "R8", "C135": "R8"})
-
 
 def texts(name: str) -> list[dict[str, str]]:
-    """Read a table of texts of this package: sentences, rules, departures or errata."""
+    """Read a table of this package: sentences, rules, departures, errata, sets, functions or parameters."""
     with (Path(__file__).with_name("texts") / f"{name}.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
+def _numbers(text: str) -> tuple[int, ...]:
+    first, _, last = text.partition("-")
+    return tuple(range(int(first), int(last) + 1)) if last else tuple(map(int, text.split()))
+
+
+_SETS = {row["set"]: row for row in texts("sets")}
+CALIBRATION_SETS: Final = MappingProxyType({name: _numbers(row["targets"]) for name, row in _SETS.items()})
+"""Targets counted from 1: 9 * column + row + 1, columns from y = +247.5 mm to -247.5 mm, rows from the top."""
+PAPER_BEST: Final = MappingProxyType({name: row["best"] for name, row in _SETS.items()})
+"""The paper's Table 5: the function that it names as the best in [29]."""
+BLIGNAUT_DEG: Final = MappingProxyType(
+    {row["function"]: tuple(float(row[name]) for name in _SETS) for row in texts("functions")}
+)
+"""[29]: mean errors (deg) of 26 participants, by function, for the sets in their order."""
 SENTENCES: Final = MappingProxyType({row["key"]: row["sentence"] for row in texts("sentences")})
 """Sentences of the paper, most of its sections 3 and 4.1, that rules test."""
 RULES: Final = MappingProxyType({row["rule"]: row for row in texts("rules")})

@@ -154,12 +154,7 @@ def observers_section(apart: Apart, shown: Sequence[str] = ()) -> Section | None
             "The effect on the gaze error: mean of the paired differences, image minus analytic, with its 95 % "
             "confidence interval. Above zero, images increase the error.",
         )
-    features_caption, gaze_caption = (
-        "Features: bias and spread, in px and at the eye",
-        "Gaze errors: paired differences, image minus analytic",
-    )
-    feature_table = table_of(features, _FEATURE_COLUMNS, features_caption, folded=len(features) > 30)
-    gaze_table = table_of(gaze, _GAZE_COLUMNS, gaze_caption, folded=len(gaze) > 20)
+    of_features, of_gaze = "Features: bias and spread, in px and at the eye", "Gaze errors: paired differences"
     return Section(
         "The observers compared",
         "The tables give image-derived minus analytic features of the same frames, and the resulting gaze errors. "
@@ -170,8 +165,8 @@ def observers_section(apart: Apart, shown: Sequence[str] = ()) -> Section | None
             "vector of both differences.)",
         ),
         effect,
-        feature_table,
-        gaze_table,
+        table_of(features, _FEATURE_COLUMNS, of_features, folded=len(features) > 30),
+        table_of(gaze, _GAZE_COLUMNS, f"{of_gaze}, image minus analytic", folded=len(gaze) > 20),
     )
 
 

@@ -75,6 +75,11 @@ class ModelResults:
     more: dict[str, Any] = field(default_factory=dict)
 
 
+def keys_of(parts: Sequence[ModelResults]) -> list[tuple[str, str]]:
+    """Return every (protocol, observer) of a run, in order."""
+    return list(dict.fromkeys(key for part in parts for key in part.done))
+
+
 def over_seeds(found: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
     """Stack the error vectors (n, 2) of every seed, (s, n, 2) by estimator; skip estimators that a seed lacks."""
     names = [name for name in (found[0] if found else ()) if all(name in one for one in found)]

@@ -46,17 +46,7 @@ from .page_parts import (
     rows_section,
     waterfall_section,
 )
-from .results import (
-    Departure,
-    Erratum,
-    Finding,
-    ModelResults,
-    Row,
-    WaterfallStep,
-    known_mean,
-    mean_row,
-    over_seeds,
-)
+from .results import Departure, Erratum, Finding, ModelResults, Row, WaterfallStep, known_mean, mean_row, over_seeds
 
 _MOST_LINES = 8  # in one panel of a figure
 _PUPIL_MM = 4.0  # diameter of a person's pupil where the scene states none
@@ -184,9 +174,10 @@ class Study:
             out.seen[key] = scenes[first].rig, seen[first]
             out.done[key] = done
             out.errors[key] = {name: one.error_deg for name, one in done.items() if len(one.error_deg)}
-            out.vectors[key] = {name: one.vector_deg for name, one in done.items() if len(one.error_deg)}
-            vectors = [{name: one.vector_deg for name, one in found.items() if len(one.error_deg)} for found in again]
-            out.seed_vectors[key] = over_seeds(vectors)
+            out.vectors[key], *more = (
+                {name: one.vector_deg for name, one in found.items() if len(one.error_deg)} for found in (done, *again)
+            )
+            out.seed_vectors[key] = over_seeds(more)
             out.rows += self.rows(done, seen, {"protocol": key[0], "observer": key[1], "eye_model": job.who})
         return out
 

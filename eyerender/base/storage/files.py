@@ -419,8 +419,9 @@ def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
     except UnicodeDecodeError:
         raise InputError("is not valid JSON: not UTF-8 text", source=source, path=path) from None
     except json.JSONDecodeError as error:
-        where = path or f"line {error.lineno}"
-        raise InputError(f"is not valid JSON: {error.msg}", source=source, path=where) from None
+        is_cut = error.pos >= len(error.doc.rstrip()) or error.msg.startswith("Unterminated")
+        reason = "ends too early; the file may have been cut off" if is_cut else error.msg
+        raise InputError(f"is not valid JSON: {reason}", source=source, path=path or f"line {error.lineno}") from None
     except ValueError as error:
         raise InputError(f"is not valid JSON: {error}", source=source, path=path) from None
 

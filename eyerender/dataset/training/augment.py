@@ -66,9 +66,11 @@ class Augmentation:
         for field in fields(self):
             value = getattr(self, field.name)
             low, high = value if isinstance(value, Sequence) and len(value) == 2 else (value, value)
-            least = 1e-3 if field.name in ("crop", "scale", "exposure", "gamma") else 0
-            if not (least <= low <= high <= most.get(field.name, 100 if field.name != "seed" else math.inf)):
-                raise InputError(f"is out of range: {value!r}", path=field.name)
+            least = {"crop": 0.05, "scale": 0.05, "exposure": 1e-3, "gamma": 1e-3}.get(field.name, 0)
+            largest = most.get(field.name, 100 if field.name != "seed" else math.inf)
+            if not (least <= low <= high <= largest):
+                reason = f"is out of range: {value!r}; from {least:g} to {largest:g}, the lower limit first"
+                raise InputError(reason, path=field.name)
 
     def changed(self, item: TrainingItem, size: tuple[int, int] | None, key: Sequence[int]) -> TrainingItem:
         """Change an item; the changes follow from the seed and `key`.

@@ -29,7 +29,7 @@ class Preparation:
         augment: random changes.
 
     Raises:
-        InputError: a part is unknown, or a value is out of range.
+        InputError: no part is named, one is unknown, or a value is out of range.
     """
 
     parts: tuple[str, ...]
@@ -40,6 +40,8 @@ class Preparation:
     augment: Augmentation | None = None
 
     def __post_init__(self) -> None:
+        if not self.parts:
+            raise InputError(f"is empty; name some of {', '.join(PARTS)}", path="parts")
         for part in self.parts:
             if part not in PARTS:
                 raise InputError(f"must be some of {', '.join(PARTS)}, not {part!r}", path="parts")
@@ -94,6 +96,9 @@ class Preparation:
                 lamps=mirrored_lamps(line) if self.flags else None,
             )
             return mirrored(item) if self.mirror_left and line["records"][0]["eye"] == "left" else item
+        except KeyError as error:
+            reason = f"has no part {part!r}: its line names no {error.args[0]!r}"
+            raise InputError(reason, source=where) from None
         except WRONG as error:
             raise InputError(f"has no part {part!r} ({type(error).__name__}: {error})", source=where) from None
 
