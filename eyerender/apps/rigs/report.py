@@ -30,6 +30,7 @@ from ...design.crowd import (
     users_of,
 )
 from ...design.eyebox import eye_box_of, eye_box_text
+from ...design.lids import LEAST_SHARE
 from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, fitted, place_of
 from ...design.safety import BOX_MM, NOTE, eye_exposure
@@ -410,13 +411,14 @@ def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) ->
         "ray": "no ray: the mirror point is off the cornea",
         "sensor": "off the sensor",
         "lid": "behind a lid, for the camera or the LED",
+        "lash": f"behind lashes: less than {100 * LEAST_SHARE:.0f} % of the glint is left",
         "obstacle": "behind an obstacle, for the camera or the LED",
         "opening": "outside an opening of the lens",
     }
     missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
     tables = [
         Table(["visible", "people x directions"], coverage, caption="Coverage."),
-        Table(["reason", "glints"], missing, caption="Why glints are missing. Lashes are not considered."),
+        Table(["reason", "glints"], missing, caption="Why glints are missing."),
         Table(["person", "covered", "glints", "outline", "noise, 95th percentile", *TRAITS], rows,
               caption="The ten people for whom the rig covers least; those with the same coverage by their noise."),
     ]  # fmt: skip
