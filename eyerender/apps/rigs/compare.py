@@ -243,7 +243,10 @@ def text_of(data: dict[str, Any]) -> str:
     """Format the comparison for a terminal."""
     lines = [f"{data['people']} people, the same in front of every rig; less is better"]
     for row in data["comparisons"]:
-        rigs, quantity, unit, first, second, difference, span, better, _ = _cells(row)
+        rigs, quantity, unit, first, second, difference, span, better, people = _cells(row)
+        if row["difference"] is None:
+            lines.append(f"{rigs}: {quantity} not known: an interval needs two people, and {people} had values")
+            continue
         verdict = f"{better} is better" if better in data["rigs"] else better
         lines.append(f"{rigs}: {quantity} ({unit}) {first} and {second}, difference {difference} [{span}]: {verdict}")
     return "\n".join(lines)
