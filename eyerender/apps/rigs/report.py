@@ -31,7 +31,7 @@ from ...design.crowd import (
 )
 from ...design.eyebox import eye_box_of, eye_box_text
 from ...design.lids import LEAST_SHARE
-from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
+from ...design.noise import FIXATION_DEG, FeatureNoise, extracted_noise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, fitted, place_of
 from ...design.safety import BOX_MM, NOTE, eye_exposure
 from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
@@ -239,6 +239,8 @@ def summary(
         "noise": {
             "outline_px": [finite_or_none(v) for v in noise.outline_px],
             "glint_px": [[finite_or_none(v) for v in row] for row in noise.glint_px],
+            "extracted_outline_px": [finite_or_none(v) for v in extracted_noise(noise).outline_px],
+            "extracted_glint_px": [[finite_or_none(v) for v in row] for row in extracted_noise(noise).glint_px],
         },
         "bound_deg": {"note": NOISE_ONLY, **gaze_of(found.bound_deg, seen)},
         "bound_with_fixation_deg": {
@@ -355,8 +357,10 @@ def _cost_section(data: dict[str, Any]) -> Section:
         ["noise, with that of fixation", degrees_text(data["bound_with_fixation_deg"]["median"]), people],
     ]
     for one in data["tolerances"] or ():
-        part = f"{one['part']} {one['number']}" if one["number"] != "all" else f"every {one['part']}"
-        what = f"{part}: {one['quantity']} {one['sd']:g} {one['when']} calibration"
+        kind, (quantity, unit) = one["part"].replace("led", "LED"), one["quantity"].rsplit("_", 1)
+        part = f"every {kind}" if one["number"] == "all" else f"{kind} {one['number']}"
+        size = f"{quantity.replace('_', ' ')} {one['sd']:g} {unit.replace('percent', '%')}"
+        what = f"{part}: {size}, {one['when']} the calibration"
         rows.append([what, degrees_text(one["gaze_deg"]), str(data["units"]["people"])])
     if data["units"] is not None:
         units = data["units"]
