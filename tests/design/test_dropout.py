@@ -124,6 +124,17 @@ def test_blur_and_motion_make_features_noisier():
     assert moving.outline_px[0] > 1.05 * sharp.outline_px[0]
 
 
+def test_the_extractor_adds_to_the_noise_of_the_sensor_most_where_that_is_small():
+    """Constants and their check on rendered frames: `scripts/bench_noise.py`."""
+    scene = er.load_scene("headset")
+    small, large = (er.design.FeatureNoise.of(edge, 0.01, rig=scene.rig) for edge in (0.01, 1.0))
+    found = [er.design.extracted_noise(noise) for noise in (small, large)]
+    assert found[0].outline_px[0] > 2.0 * small.outline_px[0]
+    assert 1.0 < found[1].outline_px[0] / large.outline_px[0] < 1.5
+    assert (found[0].glint_px > small.glint_px).all()
+    assert found[0].fixation_deg == small.fixation_deg
+
+
 def test_obstacles_and_openings_cost_the_rig_what_they_cost_features():
     """Each of 72 glints and 144 points of outlines, for the same person in front of the same rig."""
     data = ring_scene()
