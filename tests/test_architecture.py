@@ -254,7 +254,7 @@ BOUNDS = {
     "imaging": 2440,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
     "optics": 5460,  # whether a camera is inside an obstacle, for makers of rigs
     "population": 2590,
-    "region": 4110,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles; lashes of rigs
+    "region": 4110,  # heads from STL and GLB files, with all mistakes named at once; spectacle frames; lashes of rigs
     "rendering": 13020,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
     "report": 990,
     "rig": 4360,  # fisheyes, measured fall-off, flipped pictures, files of devices; mistakes in mirrors, for headsets

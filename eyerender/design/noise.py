@@ -40,7 +40,7 @@ CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
 PUPIL_DEPTH_MM, ROTATION_MM = 3.5, 10.0
 """Depth of the pupil behind the corneal apex, and its distance from the centre of rotation (both rounded)."""
 _SAMPLES, _REACH = 400, 6.0
-_EXTRACTED_OUTLINE, _EXTRACTED_GLINT = (1.25, 0.035), (1.3, 0.0)
+_EXTRACTED_OUTLINE, _EXTRACTED_GLINT = (1.25, 0.035), (1.6, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
