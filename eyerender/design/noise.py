@@ -16,7 +16,7 @@ loses its core.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +40,7 @@ CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
 PUPIL_DEPTH_MM, ROTATION_MM = 3.5, 10.0
 """Depth of the pupil behind the corneal apex, and its distance from the centre of rotation (both rounded)."""
 _SAMPLES, _REACH = 400, 6.0
+_EXTRACTED_OUTLINE, _EXTRACTED_GLINT = (1.25, 0.035), (1.6, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -114,6 +115,19 @@ def sensor_noise(
             spread = float(np.hypot(blur, size))
             glint[k, j] = glint_deviation(point * energy, spread, dark, read, sensor.full_well_e)
     return FeatureNoise(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
+
+
+def extracted_noise(noise: FeatureNoise) -> FeatureNoise:
+    """Compute the noise of the features that `extract` finds, from that of the sensor.
+
+    The extractor's own edges and fits add to it: outline_px becomes sqrt((a outline_px)^2 + b^2), and so do glints. The
+    constants were fitted on rendered frames, and checked on others (`scripts/bench_noise.py`).
+    """
+    outline, glint = (
+        np.hypot(a * known, b)
+        for known, (a, b) in ((noise.outline_px, _EXTRACTED_OUTLINE), (noise.glint_px, _EXTRACTED_GLINT))
+    )
+    return replace(noise, outline_px=frozen(outline), glint_px=frozen(glint))
 
 
 def blur_px(scene: Scene, camera: PinholeCamera, eye_mm: Floats) -> float:

@@ -6,10 +6,10 @@ Every person is calibrated at nine of the directions. The information about the 
 
 with the blocks A (frame), B and C (person) of each frame's information and its prior, is added to the information of
 every other single frame. The bound is that of the line of sight. Points of the outline and glints count if a ray
-reaches the camera, they lie on the sensor, and the lids leave the ray free: it passes between their margins, which are
-as thick as those of the rendered lids. For a glint this holds for the light's way from the LED too. Obstacles of the
-rig and openings of the lens hide features as they do for the analytic observer. Lashes and frames of spectacles are
-ignored.
+reaches the camera, they lie on the sensor, and lids and lashes leave the ray free: it passes between the lids' margins,
+which are as thick as those of the rendered lids, and the lashes' curves, which are the rendered ones where no skin
+bends them. For a glint this holds for the light's way from the LED too. Obstacles of the rig and openings of the lens
+hide features as they do for the analytic observer. Frames of spectacles are ignored.
 """
 
 from __future__ import annotations
@@ -28,13 +28,9 @@ from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import structure_of, take_eyes
 from ..eye.model import EyeModel
-from ..eye.pose import Poses, rigid_motion
-from ..optics.transforms import normalize
+from ..eye.pose import Poses
 from ..population.people import Person
 from ..region.anatomy import Region
-from ..region.contour import inner_margins
-from ..region.globe import Globe
-from ..region.lids import EDGE_MM, LOWER_TILT_DEG, margin_width_mm
 from ..rig.camera import PinholeCamera
 from ..rig.rig import RigGeometry
 from ..scene import Scene
@@ -42,6 +38,7 @@ from ..scene.people import Population
 from ..scene.spec import SceneSpec
 from .choice import SiteInformation, joined, site_matrices, with_priors
 from .information import Case, information_of_views, target_information
+from .lids import Lids, visible
 from .noise import FeatureNoise
 from .unknowns import AZIMUTH, COUNT, ELEVATION, LOCAL, PUPIL, Unknowns
 from .varied import FeatureSlopes, Views, diameters_mm, gaze_slopes, slopes_of, stacked_eyes
@@ -53,12 +50,10 @@ CALIBRATION = (0, 4, 8)
 CALIBRATION_CELLS = np.array([GRID * r + c for r in CALIBRATION for c in CALIBRATION])
 """Indices of the calibration directions among all 81."""
 TOGETHER = 8
-_MARGIN_COLUMNS = 44
 _VAGUE, _LOST_DEG = 1e3, 60.0
-_ACROSS = (0.2, 0.8, 1.0)  # places across the margin, whose rounded edges are 0 and 1
 _EXACT_DEG = 1e-3  # noise of a fixation that adds nothing to the bound
-LOST = ("ray", "sensor", "lid", "obstacle", "opening")
-"""Reasons for a missing glint: no ray (off the cornea), off the sensor, behind a lid, an obstacle, an opening."""
+LOST = ("ray", "sensor", "lid", "lash", "obstacle", "opening")
+"""Reasons for a missing glint: no ray (off the cornea), off the sensor, behind lid, lashes, obstacle or opening."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +69,7 @@ class RigPopulation:
         slippage_mm: standard deviation of the eye's position about the scene's, along each axis.
         luminance_cd_m2: luminance of what people see, which sets their pupils.
         unknowns: mapping of `Unknowns`: what is known beforehand.
-        lids: whether lids hide features.
+        lids: whether lids and lashes hide features.
         relief_mm: additional standard deviation of the eye relief, the distance along x.
         shift_mm: common shift of all positions, for maps of slippage.
     """
@@ -117,7 +112,7 @@ class Figures(ArrayValue):
         noise_deg: (p, 81) the same for an exactly known person: the part that differs between frames.
         outline: (p, 81) visible share of the outline, in the camera that sees most.
         glints: (p, 81) number of lights whose glint is visible in any camera.
-        lost: (p, 81, 5) glints (of any camera) that are missing for the reasons `LOST`.
+        lost: (p, 81, 6) glints (of any camera) that are missing for the reasons `LOST`.
         refused: numbers of people whose eye is physically impossible.
     """
 
@@ -217,16 +212,16 @@ def _groups(everyone: Sequence[Someone]) -> Iterator[list[Someone]]:
             yield same[start : start + TOGETHER]
 
 
-def cases_of(survey: RigPopulation, count: int) -> Iterator[tuple[Case, Floats | None]]:
-    """Yield cases of the first people, a few people in each, and the lids about their eyes (see `visible`)."""
-    return ((case, openings) for _, case, openings in surveyed(survey, count))
+def cases_of(survey: RigPopulation, count: int) -> Iterator[tuple[Case, Lids | None]]:
+    """Yield cases of the first people, a few people in each, and the lids about their eyes."""
+    return ((case, lids) for _, case, lids in surveyed(survey, count))
 
 
-def surveyed(survey: RigPopulation, count: int) -> Iterator[tuple[Scene, Case, Floats | None]]:
+def surveyed(survey: RigPopulation, count: int) -> Iterator[tuple[Scene, Case, Lids | None]]:
     """Yield the same with the scene whose rig is set to these people."""
     for some in _groups(people_of(survey, 0, count)[0]):
         scene = some[0].scene
-        yield scene, _case(survey, scene.rig, some), _openings(survey, some) if survey.lids else None
+        yield scene, _case(survey, scene.rig, some), lids_of(survey, some)
 
 
 def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int) -> list[SiteInformation]:
@@ -243,10 +238,11 @@ def sites_seen(survey: RigPopulation, noises: Sequence[FeatureNoise], count: int
         rig = one.scene.rig
         case = _case(survey, rig, [one])
         instants, theta = case.instants.take(CALIBRATION_CELLS), case.theta[CALIBRATION_CELLS]
-        openings = _openings(survey, [one])[CALIBRATION_CELLS] if survey.lids else None
+        lids = lids_of(survey, [one])
+        lids = None if lids is None else lids.take(CALIBRATION_CELLS)
         numbers = [np.full(len(CALIBRATION_CELLS), number) for number in range(len(rig.cameras))]
         seen = [
-            seen_features(replace(instants, camera=number), theta, camera, (openings, occluders))[0]
+            seen_features(replace(instants, camera=number), theta, camera, (lids, occluders))[0]
             for number, camera in zip(numbers, rig.cameras, strict=True)
         ]
         for part, noise in zip(parts, noises, strict=True):
@@ -260,22 +256,22 @@ def seen_features(
     views: Views,
     theta: Floats,
     camera: PinholeCamera,
-    hidden_by: tuple[Floats | None, Occluders | None],
+    hidden_by: tuple[Lids | None, Occluders | None],
     free: Bools | None = None,
 ) -> tuple[FeatureSlopes, Ints]:
     """Trace the features of the views of one camera, and remove those that are hidden.
 
-    `hidden_by` are lines along the lids' margins, as for `visible`, and what else hides features.
+    `hidden_by` are the lids of the views, and what else hides features.
 
     Returns:
-        The features that are left, and the numbers (n, 5) of glints lost by reason (`LOST`).
+        The features that are left, and the numbers (n, 6) of glints lost by reason (`LOST`).
     """
-    openings, occluders = hidden_by
+    lids, occluders = hidden_by
     slopes = slopes_of(views, theta, POINTS, free)
-    outline, mirror = (None, None) if openings is None and occluders is None else surface_points(views, theta)
-    left, why = visible(slopes, camera, openings, mirror, views.lights_mm)
+    outline, mirror = surface_points(views, theta)
+    left, why = visible(slopes, views, camera, lids, (outline, mirror))
     on_outline, of_glints = (np.zeros(ok.shape, np.int8) for ok in (left.outline_ok, left.glint_ok))
-    if occluders is not None and outline is not None and mirror is not None:
+    if occluders is not None:
         occluders.mark(on_outline, slopes.images.outline_px.copy(), outline, camera, None)
         occluders.mark(of_glints, slopes.images.glints_px.copy(), mirror, camera, views.lights_mm)
     reasons = (Status.BEHIND_OBSTACLE, Status.BEHIND_OPENING)
@@ -317,11 +313,11 @@ def _of_group(survey: RigPopulation, noise: FeatureNoise, people: list[Someone])
     i, m = len(case.theta), len(rig.lights)
     matrices, outline = np.zeros((i, COUNT, COUNT)), np.zeros(i)
     glints, lost = np.zeros((i, m), dtype=bool), np.zeros((i, len(LOST)), dtype=np.int64)
-    openings, occluders = _openings(survey, people) if survey.lids else None, survey.occluders
+    hidden_by = lids_of(survey, people), survey.occluders
     free = Unknowns.from_mapping(survey.unknowns).free()
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        slopes, why = seen_features(views, case.theta, camera, (openings, occluders), free)
+        slopes, why = seen_features(views, case.theta, camera, hidden_by, free)
         matrices += information_of_views(slopes, noise, views.camera)
         outline = np.maximum(outline, slopes.outline_ok.mean(axis=1))
         glints |= slopes.glint_ok
@@ -356,101 +352,10 @@ def _case(survey: RigPopulation, rig: RigGeometry, people: list[Someone]) -> Cas
     return Case(views=views, instant=np.arange(len(person)), instants=views, theta=theta, target_mm=nowhere)
 
 
-def _openings(survey: RigPopulation, people: list[Someone]) -> Floats:
-    """Compute lines along the lids' margins around the eye in the world, (i, len(_ACROSS), columns, 3) mm.
-
-    They depend mostly on elevation, so they are computed at three azimuths and interpolated.
-    """
+def lids_of(survey: RigPopulation, people: Sequence[Someone]) -> Lids | None:
+    """Compute the lids about people's eyes in all directions; None if they hide nothing."""
     grid = survey.directions_deg.reshape(GRID, GRID, 2)
-    poses = Poses.from_degrees(*grid[:, list(CALIBRATION)].reshape(-1, 2).T)
-    columns = np.arange(GRID)
-    shares = np.maximum(1.0 - np.abs(columns[:, None] - np.array(CALIBRATION)) / CALIBRATION[1], 0.0)
-    out = []
-    for one in people:
-        globe = Globe(
-            cornea=one.eye.front[0],
-            limbus_radius_mm=float(one.eye.limbus_radius_mm),
-            centre_mm=one.eye.sclera.centre_mm,
-            radius_mm=float(one.eye.sclera.radius_mm),
-            M=np.eye(3),
-            t=np.zeros(3),
-            mirrored=one.eye.side == "left",
-        )
-        margins = inner_margins(one.region, globe, rigid_motion(poses, one.eye), _MARGIN_COLUMNS) + one.place_mm
-        known = margins.reshape(GRID, len(CALIBRATION), -1)
-        inner = (shares @ known).reshape(GRID * GRID, _MARGIN_COLUMNS, 3)
-        out.append(_across_margin(inner, one))
-    return np.concatenate(out)
-
-
-def _across_margin(inner_mm: Floats, one: Someone) -> Floats:
-    """Compute lines along the margins, (i, len(_ACROSS), c, 3), from their inner edges (i, c, 3) mm; lids are open."""
-    angle = 2.0 * np.pi * np.arange(inner_mm.shape[1]) / inner_mm.shape[1]
-    upper, lids = np.sin(angle) >= 0.0, one.region.lids
-    normal = normalize(inner_mm - (one.place_mm + one.eye.sclera.centre_mm))
-    up = np.array([0.0, 0.0, 1.0])
-    away = normalize(up - normal * normal[..., 2:]) * np.where(upper, 1.0, -1.0)[:, None]
-    tilt = np.radians(lids.margin_tilt_deg + np.where(upper, 0.0, LOWER_TILT_DEG))[:, None]
-    width = margin_width_mm(lids.margin_mm, angle, upper, 1.0)[:, None]
-    out = np.cos(tilt) * normal + np.sin(tilt) * away
-    round_mm = EDGE_MM * width / lids.margin_mm
-    return np.stack([inner_mm + width * u * out + round_mm * (2 * u - 1) ** 4 * away for u in _ACROSS], axis=1)
-
-
-def visible(
-    slopes: FeatureSlopes,
-    camera: PinholeCamera,
-    openings: Floats | None,
-    mirror_mm: Floats | None = None,
-    lights_mm: Floats | None = None,
-) -> tuple[FeatureSlopes, Ints]:
-    """Return the features that the lids leave visible, and the numbers (n, 3) of lost glints by the first reasons.
-
-    Args:
-        slopes: the features of n views.
-        camera: the camera that sees them.
-        openings: (n, e, c, 3) mm, lines along the lids' margins that rays must pass; None: all is visible.
-        mirror_mm: (n, m, 3) mm, where the cornea mirrors each light.
-        lights_mm: (m, 3) mm, the lights.
-    """
-    traced = np.isfinite(slopes.images.glints_px).all(axis=2)
-    inside = np.where(traced, slopes.glint_ok, False)
-    hidden_glints = np.zeros_like(inside)
-    outline_ok = slopes.outline_ok
-    if openings is not None:
-        passing = inside.copy()
-        for edge in np.moveaxis(openings, 1, 0):
-            pixels, _ = camera.project(edge)
-            outline_ok = outline_ok & inside_polygon(pixels, slopes.images.outline_px)
-            passing &= inside_polygon(pixels, slopes.images.glints_px)
-            if mirror_mm is not None and lights_mm is not None:
-                passing &= lit_through(edge, mirror_mm, lights_mm)
-        hidden_glints = inside & ~passing
-    why = np.stack([(~traced).sum(axis=1), (traced & ~inside).sum(axis=1), hidden_glints.sum(axis=1)], axis=1)
-    return replace(slopes, outline_ok=outline_ok, glint_ok=inside & ~hidden_glints), why
-
-
-def lit_through(edges_mm: Floats, points_mm: Floats, lights_mm: Floats) -> Bools:
-    """Return whether each light (m, 3) reaches its point (n, m, 3) through closed curves in space (n, c, 3), (n, m)."""
-    out = np.zeros(points_mm.shape[:2], dtype=bool)
-    for k, light in enumerate(lights_mm):
-        ahead = edges_mm.mean(axis=(0, 1)) - light
-        axes = np.linalg.svd(ahead[None])[2]  # the way ahead, and two axes across it
-        edge, point = ((places - light) @ axes.T for places in (edges_mm, points_mm[:, k : k + 1]))
-        flat = [places[..., 1:] / places[..., :1] for places in (edge, point)]
-        out[:, k] = inside_polygon(*flat)[:, 0]
-    return out
-
-
-def inside_polygon(polygon_px: Floats, points_px: Floats) -> Bools:
-    """Return whether points (n, k, 2) lie inside closed polygons (n, c, 2), by the parity of crossings to the right."""
-    x0, y0 = polygon_px[:, None, :, 0], polygon_px[:, None, :, 1]
-    x1, y1 = np.roll(x0, -1, axis=2), np.roll(y0, -1, axis=2)
-    x, y = points_px[..., 0:1], points_px[..., 1:2]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        crosses = (y0 > y) != (y1 > y)
-        right = x < x0 + (y - y0) * (x1 - x0) / (y1 - y0)
-    return np.asarray((crosses & right).sum(axis=2) % 2 == 1)
+    return Lids.joined([Lids.of(one.region, one.eye, one.place_mm, grid) for one in people]) if survey.lids else None
 
 
 def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns) -> tuple[Floats, Floats]:

@@ -31,6 +31,7 @@ from ..scene.observation import EYES
 from ..scene.spec import SceneSpec
 from .crowd import OUTLINE, users_of
 from .information import Case, information_of_views, whitened_rows
+from .lids import Lids
 from .noise import FeatureNoise
 from .people import CALIBRATION_CELLS, GRID, POINTS, RigPopulation, learned, seen_features, surveyed
 from .unknowns import Unknowns
@@ -323,10 +324,10 @@ def _about(axis: Floats, angle_deg: float) -> Floats:
 
 
 def _of_group(
-    survey: RigPopulation, noise: FeatureNoise, tolerances: Tolerances, group: tuple[Scene, Case, Floats | None]
+    survey: RigPopulation, noise: FeatureNoise, tolerances: Tolerances, group: tuple[Scene, Case, Lids | None]
 ) -> tuple[Floats, Ints, Floats]:
     """Compute errors (p, 81, e, 2) deg, numbers of glints (p, 81) and shares of the outline (p, 81) of some people."""
-    scene, case, openings = group
+    scene, case, lids = group
     rig, axes, occluders = scene.rig, list(axes_of(scene, tolerances)), survey.occluders
     i, free = len(case.theta), Unknowns.from_mapping(survey.unknowns).free()
     size = len(free)
@@ -334,7 +335,7 @@ def _of_group(
     glints, outline = np.zeros((i, len(rig.lights)), dtype=bool), np.zeros(i)
     for number, camera in enumerate(rig.cameras):
         views = replace(case.instants, camera=np.full(i, number))
-        slopes, _ = seen_features(views, case.theta, camera, (openings, occluders), free)
+        slopes, _ = seen_features(views, case.theta, camera, (lids, occluders), free)
         matrices += information_of_views(slopes, noise, views.camera)
         outline, glints = np.maximum(outline, slopes.outline_ok.mean(axis=1)), glints | slopes.glint_ok
         rows = whitened_rows(slopes, noise, views.camera)

@@ -118,8 +118,8 @@ class PolynomialEstimator(BuiltIn, Generic[Fit]):
         """
         if isinstance(self.function, str):
             if self.function not in FUNCTIONS:
-                near = nearest(self.function, FUNCTIONS)
-                raise InputError(f"{shown(self.function)} is not a regression function; {near}there are R1 to R12")
+                near = nearest(self.function, FUNCTIONS) + "there are R1 to R12"
+                raise InputError(f"{shown(self.function)} is not a regression function; {near}", path="function")
             x, y = FUNCTIONS[self.function]
         else:
             x, y = self.function

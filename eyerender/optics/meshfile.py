@@ -61,9 +61,8 @@ def read_objects(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     except InputError:
         raise
     except Exception as error:
-        # Mesh readers may raise any exception for a broken file.
-        detail = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"is not a readable mesh ({detail})", source=source) from None
+        # Mesh readers may raise any exception for a broken file, whose text is about their own code.
+        raise InputError(f"is not a readable mesh: the {kind} file is damaged", source=source) from error
     if not found:
         raise InputError("holds no triangles", source=source)
     for name, mesh in found:
@@ -122,7 +121,7 @@ def _plain_glb(data: bytes, source: str) -> bytes:
         for primitive in (p for mesh in plain["meshes"] for p in mesh["primitives"]):
             primitive["material"] = 0  # trimesh gives texture coordinates only to what has a material
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"is not a readable mesh ({type(error).__name__}: {error})", source=source) from None
+        raise InputError("is not a readable mesh: its JSON is not that of glTF 2", source=source) from error
     if whole.get("extensionsRequired"):
         needed = shown(whole["extensionsRequired"])
         raise InputError(f"needs extensions of glTF: {needed}; export it without compression", source=source)

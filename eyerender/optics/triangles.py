@@ -71,6 +71,18 @@ def sharp_edges(body: Body) -> Floats:
     return frozen(mesh.vertices[edges[:: 1 + len(edges) // _MOST_DRAWN]])
 
 
+def holds(body: Body, point_mm: Floats) -> bool:
+    """Return whether a point is inside a closed body: its solid angle there is that of a sphere, not 0.
+
+    The solid angles of triangles are those of van Oosterom and Strackee (1983).
+    """
+    a, b, c = np.moveaxis((body.vertices - point_mm)[body.faces], 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    angle = 2.0 * np.arctan2((a * np.cross(b, c)).sum(axis=1), below).sum()
+    return bool(abs(angle) > 2.0 * np.pi)
+
+
 @remembered
 def tree_of(*bodies: Body) -> TriangleTree:
     """Return the tree of bodies, which are the same objects from frame to frame."""

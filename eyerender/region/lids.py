@@ -138,6 +138,11 @@ def margin_width_mm(thickest_mm: float, angle: Floats, upper: Bools, openness: f
     return np.asarray(0.45 * thickest_mm + (middle - 0.45 * thickest_mm) * step(np.abs(np.sin(angle)), 0.0, 0.55))
 
 
+def lash_line(spec: Region, globe: Globe, c: Contour) -> Floats:
+    """Compute the outer edge (columns, 3) mm of the margin of a contour."""
+    return _margin(spec, globe, c)[1]
+
+
 def _across() -> tuple[Floats, Floats]:
     """Return positions of the margin's rows, from its inner edge (0) to the outer one (1), and their rounding (mm)."""
     turn = np.cos(np.pi * np.linspace(0, 1, MARGIN)[:, None, None])

@@ -23,6 +23,7 @@ from ..base.arrays import ArrayValue, Bools, Floats, frozen
 from ..base.spec import NonNegative, Spec, Vec3
 from ..optics.interface import fresnel
 
+_OFF_PLANE = 0.1  # largest distance of an outline's corner from the plane, of the outline's size
 _STEPS = 30  # of the fixed point; each reduces the error by the ratio of the plate's thickness to the distance
 
 
@@ -51,7 +52,29 @@ class Mirror(Spec):
     def _check(self) -> Self:
         if not np.linalg.norm(self.normal) > 1e-9:
             raise ValueError("normal must not be zero")
+        if self.outline_mm is not None:
+            self._check_outline(np.array(self.outline_mm, dtype=float))
         return self
+
+    def _check_outline(self, corners: Floats) -> None:
+        """Refuse an outline that is far from the plane, or crosses itself in it."""
+        normal, offset = self.plane
+        off, size = np.abs(corners @ normal - offset), float(np.ptp(corners, axis=0).max())
+        if (k := int(off.argmax())) >= 0 and off[k] > _OFF_PLANE * size:
+            raise ValueError(f"outline_mm.{k} is {off[k]:.3g} mm off the plane of point_mm and normal")
+        a = corners @ np.linalg.svd(normal[None])[2][1:].T
+        b, count = np.roll(a, -1, axis=0), len(a)
+
+        def side(start: Floats, end: Floats, at: Floats) -> Floats:
+            (x, y), (u, v) = np.moveaxis(end - start, -1, 0), np.moveaxis(at - start, -1, 0)
+            return np.asarray(np.sign(x * v - y * u))
+
+        i, j = np.triu_indices(count, 2)
+        apart = (side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]), side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]))
+        cross = (apart[0] < 0) & (apart[1] < 0)
+        if cross.any():
+            first, other = i[cross][0], j[cross][0]
+            raise ValueError(f"outline_mm crosses itself: its sides from corner {first} and from corner {other} meet")
 
     @property
     def plane(self) -> tuple[Floats, float]:

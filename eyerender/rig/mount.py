@@ -95,6 +95,10 @@ class IpdAdjustment(Spec):
     def _check(self) -> Self:
         if self.range_mm[0] > self.range_mm[1]:
             raise ValueError("range_mm must not fall")
+        # The setting of a drawn person has the residual in it.
+        if self.set_mm is not None and abs(self.set_mm - self.nearest_mm(self.set_mm)) > 6.0 * self.residual_mm:
+            low, high = self.range_mm
+            raise ValueError(f"set_mm is {self.set_mm:g}, outside range_mm, {low:g} to {high:g}")
         return self
 
     def nearest_mm(self, ipd_mm: float) -> float:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
-from ..base.arrays import ArrayValue, Body, Bools, Floats, Ints
+from ..base.arrays import ArrayValue, Body, Bools, Floats, Ints, remembered
 from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Side, Spec
+from ..optics.triangles import holds
 from .camera import Camera, PinholeCamera, serves
 from .light import MAX_LIGHTS, Lamp, Led
 from .mount import IpdAdjustment, Mount, RigidMotion
@@ -238,6 +239,11 @@ class RigLike(Protocol):
         ...
 
 
+@remembered
+def _inside(camera: PinholeCamera, body: Body) -> bool:
+    return holds(body, camera.nodal_point_mm)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry(ArrayValue):
     """Cameras, lights, the screen, if there is one, and obstacles as authored, before a mount moves them.
@@ -266,7 +272,7 @@ class RigGeometry(ArrayValue):
         """Build the obstacles in the world; the same objects until a file changes.
 
         Raises:
-            InputError: the file of an obstacle cannot be read.
+            InputError: the file of an obstacle cannot be read, or a camera is inside an obstacle.
         """
         out = []
         for k, obstacle in enumerate(self.obstacles):
@@ -275,6 +281,9 @@ class RigGeometry(ArrayValue):
                 out.append(body if self.moved_by is None else self.moved_by.body(body))
             except InputError as error:
                 raise error.placed(under=f"rig.obstacles.{k}.file") from None
+            for number, camera in enumerate(self.cameras):
+                if _inside(camera, out[-1]):
+                    raise InputError(f"camera {number} is inside it, and sees nothing", path=f"rig.obstacles.{k}")
         return tuple(out)
 
     def lights_of(self, eye: int) -> tuple[int, ...]:

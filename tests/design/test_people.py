@@ -13,8 +13,9 @@ import eyerender as er
 from eyerender.cli.main import run
 from eyerender.design.crowd import users_of
 from eyerender.design.information import information
+from eyerender.design.lids import inside_polygon
 from eyerender.design.noise import sensor_noise
-from eyerender.design.people import GRID, RigPopulation, figures_of, inside_polygon, people_of
+from eyerender.design.people import GRID, RigPopulation, figures_of, people_of
 from eyerender.design.unknowns import Unknowns
 
 

@@ -307,7 +307,7 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
     [
         ("schema", [10**200] * 3, "schema: is [10000000000"),
         ("estimator.name", "magic", "estimator.name: must be"),
-        ("estimator.function", "R13", "estimator: 'R13' is not a regression function"),
+        ("estimator.function", "R13", "estimator.function: 'R13' is not a regression function"),
         ("eyes", [], "eyes: must hold a calibration for each eye"),
         ("eyes.third", {}, "eyes: must hold a calibration for each eye"),
         ("eyes.right", 3, "eyes.right: must be a mapping"),

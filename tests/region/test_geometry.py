@@ -20,7 +20,7 @@ from eyerender.region.brow import brow
 from eyerender.region.contour import COLUMNS, contour, inner_margins
 from eyerender.region.globe import Globe
 from eyerender.region.hairs import SEGMENTS, Hairs, tube_faces
-from eyerender.region.lashes import lashes, plan
+from eyerender.region.lashes import free_lashes, lashes, plan
 from eyerender.region.lids import CONJUNCTIVA, FACE, FINE, LID, MARGIN, ROWS, _margin, _skin, sheet
 from eyerender.region.mesh import region_mesh, sheet_faces
 from eyerender.region.skin import LASH, LASH_U, band_row, skin_map
@@ -216,6 +216,15 @@ def test_open_tubes_have_the_outlines_of_closed_ones():
         )
         assert 200 < np.count_nonzero(closed) < 3600
         assert np.mean(closed != open_) < 2e-3  # lines along a hair leave it through its open end
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_free_lashes_are_the_lashes_where_no_skin_bends_them(mirrored):
+    spec, globe = Region(seed=2), replace(Globe.sphere(), mirrored=mirrored)
+    drawn, free = lashes(spec, globe, sheet(spec, globe)), free_lashes(spec, globe)
+    apart = np.linalg.norm(drawn.points * globe.mirror - free.points, axis=2)[: spec.lashes.upper_count]
+    assert np.mean(apart < 0.02) > 0.9
+    np.testing.assert_array_equal(drawn.radii, free.radii)
 
 
 def test_lashes_are_open_on_the_inner_side_of_their_bend():

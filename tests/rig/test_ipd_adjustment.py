@@ -8,7 +8,9 @@ import pytest
 import eyerender as er
 from eyerender.apps.rigs.options import RigSize
 from eyerender.apps.rigs.report import survey_of
+from eyerender.base.errors import InputError
 from eyerender.design.people import fitted, people_of
+from eyerender.rig.mount import IpdAdjustment
 
 ADJUST = {"range_mm": [58.0, 70.0], "residual_mm": 0.4}
 
@@ -17,6 +19,13 @@ ADJUST = {"range_mm": [58.0, 70.0], "residual_mm": 0.4}
 def scene():
     """The headset with two eyes, whose cameras and LEDs serve one each."""
     return er.load_scene("headset_binocular").with_({"rig.ipd_adjust": ADJUST})
+
+
+def test_a_setting_outside_the_range_is_refused():
+    with pytest.raises(InputError, match=r"set_mm is 90, outside range_mm, 58 to 70"):
+        IpdAdjustment.from_mapping({"range_mm": [58.0, 70.0], "set_mm": 90.0})
+    drawn = {"range_mm": [58.0, 70.0], "set_mm": 70.4, "residual_mm": 0.1}  # the residual of a person is in it
+    assert IpdAdjustment.from_mapping(drawn).set_mm == 70.4
 
 
 def test_the_pictures_of_both_eyes_stay_within_the_range_and_move_beyond_it(scene):

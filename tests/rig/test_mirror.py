@@ -236,6 +236,22 @@ def small(centre_px: np.ndarray, half_px: float) -> dict[str, object]:
     return {**MIRROR, "outline_mm": (start + ways * ((offset - normal @ start) / (ways @ normal))[:, None]).tolist()}
 
 
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        ([[0, 0, 0], [0, 10, 0], [0, 10, 10], [4, 0, 10]], "outline_mm.3 is 4 mm off the plane of point_mm and normal"),
+        (
+            [[0, 0, 0], [0, 10, 10], [0, 10, 0], [0, 0, 10]],
+            "outline_mm crosses itself: its sides from corner 0 and",
+        ),
+    ],
+)
+def test_outlines_that_are_none_are_refused(corners, words):
+    with pytest.raises(InputError, match=words):
+        Mirror.from_mapping({"point_mm": [0, 0, 0], "normal": [1, 0, 0], "outline_mm": corners})
+    Mirror.from_mapping({"point_mm": [0, 0, 0], "normal": [1, 0, 0], "outline_mm": [[0, 0, 0], [0, 9, 0], [0.5, 0, 9]]})
+
+
 def test_nothing_is_seen_beside_the_outline():
     plain = er.trace(scene(mirror=MIRROR))
     glints = plain.glints.xy_px[0]

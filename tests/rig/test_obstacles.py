@@ -10,7 +10,7 @@ import trimesh
 
 import eyerender as er
 from eyerender.base.errors import InputError
-from eyerender.optics.triangles import TriangleTree
+from eyerender.optics.triangles import TriangleTree, holds
 from eyerender.rig.mount import Mount
 from eyerender.rig.obstacles import Obstacle, ObstacleRing
 
@@ -127,6 +127,22 @@ def test_files_that_cannot_be_obstacles_end_with_one_line(tmp_path):
     mirror = {"point_mm": [30, 0, 0], "normal": [1, 0, 1]}
     with pytest.raises(InputError, match="obstacles: cannot be given with a camera that looks past a mirror"):
         er.Rig.from_mapping({**RIG, "cameras": [{**CAMERA, "mirror": mirror}], "obstacles": [{"ring": RING}]})
+
+
+def test_cameras_inside_a_body_are_refused_and_those_in_its_hole_are_not():
+    def bodies(radii):
+        ring = {"centre_mm": CAMERA["position_mm"], "inner_radius_mm": radii[0], "outer_radius_mm": radii[1]}
+        return er.Rig.from_mapping({**RIG, "obstacles": [{"ring": {**ring, "depth_mm": 9.0}}]}).build().bodies()
+
+    assert len(bodies((5.0, 9.0))) == 1
+    body = bodies((5.0, 9.0))[0]
+    away = np.cross([1.0, 0.0, 0.0], [0.0, 0.6, 0.8])
+    start = np.array(CAMERA["position_mm"], dtype=float)
+    assert [holds(body, start + d * away) for d in (0.0, 4.9, 5.1, 8.9, 9.1)] == [False, False, True, True, False]
+    beside = [*CAMERA["position_mm"][:2], CAMERA["position_mm"][2] + 7.0]
+    ring = {"centre_mm": beside, "inner_radius_mm": 5.0, "outer_radius_mm": 9.0, "depth_mm": 9.0}
+    with pytest.raises(InputError, match=r"rig.obstacles.0: camera 0 is inside it"):
+        er.Rig.from_mapping({**RIG, "obstacles": [{"ring": ring}]}).build().bodies()
 
 
 def test_a_ring_has_a_rectangular_section():

@@ -207,17 +207,19 @@ def page_of(data: dict[str, Any]) -> Page:
         *(f"{name}: {eye_box_text(box)}" for name, box in data["eye_boxes"].items()),
     ]
     cards = [Card(f"{len(better)} of {len(data['comparisons'])}", "quantities in which one rig is better")]
+    names, caption = data["rigs"], "Thirds of the people with low, middle and high values."
+    head = ["quantity", "better", "difference", "95 % interval", *(names if len(names) == 2 else ("first", "second"))]
+    head = [*([] if len(names) == 2 else ["rigs"]), *head, "people"]
+
+    def cells(row: dict[str, Any]) -> list[str]:
+        rigs, quantity, unit, first, second, difference, span, better, people = _cells(row)
+        own = [f"{quantity} ({unit})", better, difference, span, first, second, people]
+        return own if len(names) == 2 else [rigs, *own]
+
+    thirds = [[f"{row['trait']}, {row['third']}", *cells(row)] for row in data["for_whom"]]
     sections = [
-        Section("Which is better?", Table(_HEAD, [_cells(row) for row in data["comparisons"]], wide=(0,))),
-        Section(
-            "For whom?",
-            Table(
-                ["trait", "third", *_HEAD],
-                [[row["trait"], row["third"], *_cells(row)] for row in data["for_whom"]],
-                caption="Thirds of the people with low, middle and high values.",
-                wide=(2,),
-            ),
-        ),
+        Section("Which is better?", Table(head, [cells(row) for row in data["comparisons"]], wide=(0,))),
+        Section("For whom?", Table(["people with", *head], thirds, caption=caption, wide=(0,))),
         Section(
             "What the quantities are",
             Table(["quantity", "meaning"], [[k, one["meaning"]] for k, one in data["quantities"].items()], wide=(1,)),
@@ -226,10 +228,8 @@ def page_of(data: dict[str, Any]) -> Page:
     return Page("Rigs compared: " + ", ".join(data["rigs"]), lead, cards, sections)
 
 
-_HEAD = ["rigs", "quantity", "unit", "first", "second", "difference", "95 % interval", "better", "people"]
-
-
 def _cells(row: dict[str, Any]) -> list[str]:
+    """Format rigs, quantity, unit, first, second, difference, interval, the better one and the number of people."""
     a, b = row["rigs"]
     better = {"a": a, "b": b}.get(row["verdict"], row["verdict"])
     span = f"{number(row['low'])} to {number(row['high'])}"
@@ -243,7 +243,10 @@ def text_of(data: dict[str, Any]) -> str:
     """Format the comparison for a terminal."""
     lines = [f"{data['people']} people, the same in front of every rig; less is better"]
     for row in data["comparisons"]:
-        rigs, quantity, unit, first, second, difference, span, better, _ = _cells(row)
+        rigs, quantity, unit, first, second, difference, span, better, people = _cells(row)
+        if row["difference"] is None:
+            lines.append(f"{rigs}: {quantity} not known: an interval needs two people, and {people} had values")
+            continue
         verdict = f"{better} is better" if better in data["rigs"] else better
         lines.append(f"{rigs}: {quantity} ({unit}) {first} and {second}, difference {difference} [{span}]: {verdict}")
     return "\n".join(lines)

@@ -30,7 +30,8 @@ from ...design.crowd import (
     users_of,
 )
 from ...design.eyebox import eye_box_of, eye_box_text
-from ...design.noise import FIXATION_DEG, FeatureNoise, sensor_noise
+from ...design.lids import LEAST_SHARE
+from ...design.noise import FIXATION_DEG, FeatureNoise, extracted_noise, sensor_noise
 from ...design.people import CALIBRATION_CELLS, GRID, LOST, Figures, RigPopulation, fitted, place_of
 from ...design.safety import BOX_MM, NOTE, eye_exposure
 from ...design.tolerances import UNIT_PEOPLE, Tolerances, of_this_eye, tolerated
@@ -238,6 +239,8 @@ def summary(
         "noise": {
             "outline_px": [finite_or_none(v) for v in noise.outline_px],
             "glint_px": [[finite_or_none(v) for v in row] for row in noise.glint_px],
+            "extracted_outline_px": [finite_or_none(v) for v in extracted_noise(noise).outline_px],
+            "extracted_glint_px": [[finite_or_none(v) for v in row] for row in extracted_noise(noise).glint_px],
         },
         "bound_deg": {"note": NOISE_ONLY, **gaze_of(found.bound_deg, seen)},
         "bound_with_fixation_deg": {
@@ -354,8 +357,10 @@ def _cost_section(data: dict[str, Any]) -> Section:
         ["noise, with that of fixation", degrees_text(data["bound_with_fixation_deg"]["median"]), people],
     ]
     for one in data["tolerances"] or ():
-        part = f"{one['part']} {one['number']}" if one["number"] != "all" else f"every {one['part']}"
-        what = f"{part}: {one['quantity']} {one['sd']:g} {one['when']} calibration"
+        kind, (quantity, unit) = one["part"].replace("led", "LED"), one["quantity"].rsplit("_", 1)
+        part = f"every {kind}" if one["number"] == "all" else f"{kind} {one['number']}"
+        size = f"{quantity.replace('_', ' ')} {one['sd']:g} {unit.replace('percent', '%')}"
+        what = f"{part}: {size}, {one['when']} the calibration"
         rows.append([what, degrees_text(one["gaze_deg"]), str(data["units"]["people"])])
     if data["units"] is not None:
         units = data["units"]
@@ -410,13 +415,14 @@ def _who_section(survey: RigPopulation, found: Figures, data: dict[str, Any]) ->
         "ray": "no ray: the mirror point is off the cornea",
         "sensor": "off the sensor",
         "lid": "behind a lid, for the camera or the LED",
+        "lash": f"behind lashes: less than {100 * LEAST_SHARE:.0f} % of the glint is left",
         "obstacle": "behind an obstacle, for the camera or the LED",
         "opening": "outside an opening of the lens",
     }
     missing = [[why[name], f"{100 * share:.1f} %"] for name, share in data["glints_missing"].items()]
     tables = [
         Table(["visible", "people x directions"], coverage, caption="Coverage."),
-        Table(["reason", "glints"], missing, caption="Why glints are missing. Lashes are not considered."),
+        Table(["reason", "glints"], missing, caption="Why glints are missing."),
         Table(["person", "covered", "glints", "outline", "noise, 95th percentile", *TRAITS], rows,
               caption="The ten people for whom the rig covers least; those with the same coverage by their noise."),
     ]  # fmt: skip

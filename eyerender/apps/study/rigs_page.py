@@ -80,7 +80,7 @@ def _why(rows: Any) -> Table:
     body = [
         [row["layout"], str(len(row["leds"])), *(f"{row['glints_missing'][name]:.2f}" for name in LOST)] for row in rows
     ]
-    head = ["layout", "LEDs", "off the cornea", "off the sensor", "behind a lid", "an obstacle", "an opening"]
+    head = ["layout", "LEDs", "off the cornea", "off the sensor", "behind a lid", "lashes", "an obstacle", "an opening"]
     return Table(head, body, "Mean number of glints that are missing, by reason.")
 
 

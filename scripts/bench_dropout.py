@@ -1,0 +1,121 @@
+#!/usr/bin/env python3
+"""Which glints do lids and lashes hide? `eyerender rig` against the labels of rendered pictures.
+
+    bench_dropout.py [--quick] [--people N] [--json F]
+
+Adults whose upper lids stand at 60, 80 and 100 % of their own height look in nine directions up to 25 degrees from the
+middle. Two rigs have a ring of eight LEDs 16 mm before the eye: one with a camera of 100 degrees below the eye at the
+temple, one with a camera before and above it, which looks through the upper lashes. A glint is lost in a label if less
+than half of it is visible, behind lids or lashes. Rows state the share of the glints that labels lose which the report
+on the rig loses too, and the reverse, for each opening of the lids, and for all.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from _bench import Report, options_of, row, single_threaded
+
+single_threaded()
+
+import eyerender as er
+from eyerender.base.arrays import Bools
+from eyerender.design import people
+from eyerender.design.unknowns import COUNT, Unknowns
+from eyerender.scene.spec import SceneSpec
+
+SHARE = 0.9
+UPPER = (0.6, 0.8, 1.0)
+CELLS = people.CALIBRATION_CELLS
+REASONS = ("lid", "lash")
+CAMERAS = {
+    "below": {"position_mm": [18.0, -53.5, -14.0], "look_at_mm": [0.0, -31.5, 0.0], "focal_length_px": 168.0},
+    "above": {"position_mm": [34.0, -31.5, 16.0], "look_at_mm": [0.0, -31.5, 0.0], "focal_length_px": 300.0},
+}
+
+
+def rig_of(name: str) -> dict[str, Any]:
+    """The scene of one camera and eight LEDs on a ring of 22 mm."""
+    camera = {**CAMERAS[name], "resolution_px": [400, 400]}
+    lights = [
+        {"position_mm": [16.0, -31.5 + 22 * np.cos(a), 22 * np.sin(a)], "intensity_mw_sr": 1.0, "radius_mm": 0.5}
+        for a in (np.arange(8) * np.pi / 4).tolist()
+    ]
+    data = er.load_scene("head_mounted").spec.to_mapping()
+    return {**data, "rig": {"cameras": [camera], "lights": lights}, "image": {"spp": 4}}
+
+
+def survey_of(scene: dict[str, Any]) -> people.RigPopulation:
+    """Adults in front of the rig, without slippage."""
+    return people.RigPopulation(
+        scene=scene, population=er.Population("adults").to_mapping(), unknowns=Unknowns.population().to_mapping(),
+        azimuth_deg=25.0, elevation_deg=25.0, slippage_mm=0.0,
+    )  # fmt: skip
+
+
+def lost_by_rig(survey: people.RigPopulation, one: people.Someone) -> tuple[Bools, Bools]:
+    """Which glints (9, m) exist, and which of them the report loses behind lids or lashes."""
+    case = people._case(survey, one.scene.rig, [one])
+    views, theta = replace(case.instants.take(CELLS), camera=np.zeros(len(CELLS), np.int64)), case.theta[CELLS]
+    lids, free, camera = people.lids_of(survey, [one]), np.zeros(COUNT, dtype=bool), one.scene.rig.cameras[0]
+    assert lids is not None
+    every, left = (
+        people.seen_features(views, theta, camera, (hiding, None), free)[0].glint_ok
+        for hiding in (None, lids.take(CELLS))
+    )
+    return every, every & ~left
+
+
+def lost_by_labels(survey: people.RigPopulation, one: people.Someone) -> tuple[Bools, Bools]:
+    """Which glints (9, m) labels call lost behind lids, and which behind lashes."""
+    spec = SceneSpec.from_mapping(survey.scene)
+    subject = er.Subject.of(
+        er.Population("adults").person(one.subject, 0), eyes=("right",), ipd_mm=63.0, luminance_cd_m2=20.0,
+        accommodation_d=0.0, head_positions_mm=(tuple((one.place_mm - [0.0, -31.5, 0.0]).tolist()),),
+    )  # fmt: skip
+    poses = er.EyeDirection.listed(survey.directions_deg[CELLS])
+    scene = er.Scene(subject, spec.rig, poses=poses, image=spec.image).with_({"region": one.region.to_mapping()})
+    found = [image.rendered for image in er.render(scene)]
+    lost = np.array([one.glints.share for one in found]) < 0.5
+    by = [np.array([[word in text for text in one.glint_reasons] for one in found]) for word in REASONS]
+    return lost & by[0], lost & by[1]
+
+
+def main() -> int:
+    """Compare both for every person, opening and rig."""
+    parser = options_of(__doc__, "one person, without bars")
+    parser.add_argument("--people", type=int, default=4, help="people before each rig")
+    options = parser.parse_args()
+    count, report = 1 if options.quick else options.people, Report()
+    must, sums = None if options.quick else SHARE, {}
+    for name in CAMERAS:
+        survey = survey_of(rig_of(name))
+        for plain in people.people_of(survey, 5, count)[0]:
+            for upper in UPPER:
+                height = max(upper * plain.region.fissure.upper_mm, 2.2)
+                fissure = plain.region.fissure.model_copy(update={"upper_mm": height})
+                one = replace(plain, region=plain.region.model_copy(update={"fissure": fissure}))
+                exist, rig = lost_by_rig(survey, one)
+                lid, lash = (exist & hidden for hidden in lost_by_labels(survey, one))
+                counts = [lid.sum(), lash.sum(), rig.sum(), (rig & (lid | lash)).sum(), (rig & lash).sum()]
+                for key in ((name, upper), (name, None), ("both", None)):
+                    sums[key] = sums.get(key, np.zeros(5)) + counts
+            print(f"camera {name}: person {plain.subject}", file=sys.stderr, flush=True)
+    for (name, upper), (lid, lash, lost, both, lashes) in sorted(sums.items(), key=lambda one: one[0][1] is None):
+        what = f"{name}, upper lids at {'any height' if upper is None else f'{100 * upper:.0f} %'}"
+        report.add(row(f"{what}: glints that labels lose", lid + lash, ""))
+        report.add(row(f"{what}: of them behind lashes", lash, ""))
+        bar = must if upper is None else None
+        report.add(row(f"{what}: lost by labels, and by rig", both / max(lid + lash, 1), "share", bar, at_least=True))
+        report.add(row(f"{what}: lost by rig, and by labels", both / max(lost, 1), "share", bar, at_least=True))
+        if lash:
+            report.add(row(f"{what}: lost by labels behind lashes, and by rig", lashes / lash, "share"))
+    return report.finish(options.json, ("numpy", "mitsuba"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
