@@ -1,0 +1,104 @@
+"""Networks in ONNX files as extractors, and the example that makes one."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from eyerender.apps.benchmark.network import load_network
+from eyerender.base.errors import InputError
+from eyerender.cli.main import run
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+META = {"eyerender": "network/1"}
+OUTPUTS = {"pupil_ellipse": [[30.0, 20.0, 8.0, 5.0, 0.5]], "confidence": [[0.9]]}
+
+
+def network(path, *, outputs=OUTPUTS, shape=(1, 1, 40, 60), meta=META, domain="", external=False):
+    """Write a network that answers the same ellipse for every picture (plus 0 times the picture's mean)."""
+    helper = onnx.helper
+    nodes = [helper.make_node("ReduceMean", ["image"], ["mean"], keepdims=0),
+             helper.make_node("Sub", ["mean", "mean"], ["zero"], domain=domain)]  # fmt: skip
+    weights, results = [], []
+    for name, values in outputs.items():
+        weights.append(onnx.numpy_helper.from_array(np.array(values, np.float32), f"{name}_constant"))
+        nodes.append(helper.make_node("Add", ["zero", f"{name}_constant"], [name]))
+        results.append(helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None))
+    image = helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, shape)
+    graph = helper.make_graph(nodes, "constant", [image], results, weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, meta)
+    if external:
+        onnx.save(model, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    else:
+        onnx.save(model, path)
+    return path
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    """A picture of 120 x 160 px, which a network of 60 x 40 px sees at a quarter of its size, 15 px from the left."""
+    home = tmp_path / "pictures"
+    home.mkdir()
+    Image.fromarray(np.full((160, 120), 100, np.uint8)).save(home / "a.png")
+    row = "image,centre_x_px,centre_y_px,semi_axis_a_px,semi_axis_b_px,angle_deg"
+    (home / "labels.csv").write_text(f"{row}\na.png,61.5,81.5,32,20,{np.degrees(0.5)}\n")
+    return home
+
+
+def test_a_network_runs_as_an_extractor_in_px_of_the_picture(pictures, tmp_path):
+    path = network(tmp_path / "constant.onnx")
+    assert run(["bench-extractors", str(pictures), "-o", str(tmp_path / "out"), "--extractor", f"onnx:{path}"]) == 0
+    (entry,) = json.loads((tmp_path / "out" / "results.json").read_text())["extractors"]
+    assert entry["name"] == "constant"
+    assert entry["summary"]["right"] == 1
+    assert entry["summary"]["centre_px"]["median"] == pytest.approx(0, abs=1e-5)
+    assert entry["summary"]["semi_axes_bias_px"] == pytest.approx([0, 0], abs=1e-4)
+
+
+def test_an_unsure_network_finds_no_pupil(pictures, tmp_path):
+    path = network(tmp_path / "unsure.onnx", outputs=OUTPUTS | {"confidence": [[0.4]]}, shape=("n", 1, 40, 60))
+    arguments = ["bench-extractors", str(pictures), "-o", str(tmp_path / "out"), "--extractor", f"unsure=onnx:{path}"]
+    assert run(arguments) == 0
+    (entry,) = json.loads((tmp_path / "out" / "results.json").read_text())["extractors"]
+    assert entry["summary"]["none"] == 1
+    assert entry["failures"][0]["reason"] == "the network's confidence is 0.40"
+
+
+WRONG = {
+    "no metadata": ({"meta": {}}, "its metadata must hold 'eyerender': 'network/1', not nothing"),
+    "other metadata": ({"meta": {"eyerender": "network/2"}}, "not 'network/2'"),
+    "no confidence": ({"outputs": {"pupil_ellipse": [[1, 2, 3, 4, 5]]}}, "has no output confidence"),
+    "four numbers": ({"outputs": OUTPUTS | {"pupil_ellipse": [[1, 2, 3, 4]]}}, "must hold 5 finite numbers"),
+    "not finite": ({"outputs": OUTPUTS | {"confidence": [[np.nan]]}}, "must hold 1 finite numbers"),
+    "colours": ({"shape": (1, 3, 40, 60)}, "must have one float32 input (1, 1, h, w)"),
+    "no size": ({"shape": (1, 1, "h", "w")}, "must have one float32 input"),
+    "huge": ({"shape": (1, 1, 40, 50_000)}, "up to 4096 px"),
+    "other files": ({"external": True}, "keeps weights in other files"),
+    "unknown operators": ({"domain": "evil"}, "ONNX Runtime refuses it"),
+}
+
+
+@pytest.mark.parametrize(("changes", "words"), WRONG.values(), ids=WRONG)
+def test_a_wrong_network_is_refused(tmp_path, changes, words):
+    with pytest.raises(InputError) as refused:
+        load_network(str(network(tmp_path / "wrong.onnx", **changes)))
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("content", "words"), [(b"no network", "is not an ONNX file"), (None, "no such file")])
+def test_a_file_that_is_no_network_ends_the_command_with_one_line(pictures, tmp_path, capfd, content, words):
+    path, output = tmp_path / "wrong.onnx", tmp_path / "out"
+    if content is not None:
+        path.write_bytes(content)
+    assert run(["bench-extractors", str(pictures), "-o", str(output), "--extractor", f"onnx:{path}"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"error: --extractor onnx:{path}: ")
+    assert words in line
+    assert not output.exists()
