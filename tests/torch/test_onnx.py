@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from PIL import Image
 from eyerender.apps.benchmark.network import load_network
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
+from tests.support.paths import ROOT
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -102,3 +105,24 @@ def test_a_file_that_is_no_network_ends_the_command_with_one_line(pictures, tmp_
     assert line.startswith(f"error: --extractor onnx:{path}: ")
     assert words in line
     assert not output.exists()
+
+
+def test_the_example_trains_tests_and_writes_a_network_that_the_benchmark_takes(folder, tmp_path):
+    source = next((folder / "images").rglob("*.png"))
+    (tmp_path / "one__eye.png").write_bytes(source.read_bytes())
+    table = tmp_path / "ellipses.csv"
+    table.write_text("file,x_px,y_px,a_px,b_px,angle_deg\none__eye.png,20,20,5,4,30\n")
+    script = [sys.executable, ROOT / "examples" / "gaze_network.py", folder, "--copies", "4", "--epochs", "1"]
+    options = ["--test", folder, "--onnx", tmp_path / "gaze.onnx", "--pictures", tmp_path, "--ellipses", table]
+    done = subprocess.run([*script, *options], capture_output=True, text=True, check=True)
+    written, tested, *figures = done.stdout.splitlines()[2:]
+    assert "outputs within" in written  # the script ends with an error if they differ by more than 1e-4
+    assert float(written.split("within ")[1].split()[0]) <= 1e-4
+    assert tested.endswith("1 networks")
+    (error,) = [line.split()[2] for line in figures if line.startswith("  gaze, deg")]
+    assert 0 <= float(error) <= 180
+    assert figures[-1].split()[:2] == ["one", "1"]
+    assert load_network(str(tmp_path / "gaze.onnx")).size == (128, 128)
+    failed = subprocess.run([*script[:2], tmp_path / "none"], capture_output=True, text=True, check=False)
+    assert failed.returncode == 2
+    assert len(failed.stderr.splitlines()) == 1
