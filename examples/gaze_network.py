@@ -6,15 +6,14 @@ From a recipe to a running network
 This script trains a small network on rendered eyes and writes it as an ONNX file. From one grey picture the network
 finds the pupil's ellipse, the line of sight, the openness of the lids, the pupil's diameter, and a confidence::
 
-    eyerender generate people_two_cameras -o out/two --subjects 400 --count 400 --seed 61 --splits train=1 \\
-        --size 128x128 --spp 4
-    eyerender generate people_any_headset -o out/any --subjects 600 --count 600 --seed 71 --splits train=1 \\
-        --size 128x128 --spp 4
-    eyerender generate people_two_cameras -o out/people --subjects 10 --count 280 --seed 62 --splits test=1 \\
-        --size 128x128 --spp 4
-    eyerender generate people_any_headset -o out/rigs --subjects 10 --count 280 --seed 72 --splits test=1 \\
-        --size 128x128 --spp 4
-    python examples/gaze_network.py out/two out/any --test out/people out/rigs --onnx gaze.onnx
+    small="--size 128x128 --spp 4"
+    eyerender generate people_two_cameras -o out/two --subjects 400 --count 400 --seed 61 --splits train=1 $small
+    eyerender generate people_any_headset -o out/any --subjects 600 --count 600 --seed 71 --splits train=1 $small
+    eyerender generate people_two_cameras -o out/people --subjects 10 --count 200 --seed 62 --splits test=1 $small
+    eyerender generate people_any_headset -o out/rigs --subjects 10 --count 200 --seed 72 --splits test=1 $small
+    python examples/gaze_network.py --write-moved moved.yaml
+    eyerender generate moved.yaml -o out/moved --subjects 10 --count 200 --seed 63 --splits test=1 $small
+    python examples/gaze_network.py out/two out/any --test out/people out/rigs out/moved --onnx gaze.onnx
 
 The network is trained on the split ``train`` of the first folders and tested on the split ``test`` of the others, whose
 people and rigs it has not seen. The script prints the errors with 95 % intervals, which come from drawing the people
@@ -43,6 +42,7 @@ from torch.nn import functional as F
 from torch.utils.data import ConcatDataset, DataLoader
 
 from eyerender.base.errors import InputError
+from eyerender.dataset import find_dataset
 from eyerender.rig.camera import PinholeCamera
 from eyerender.torch import Augment, FolderDataset
 
@@ -52,6 +52,15 @@ POINTS = ("pupil", "iris", "outer corner", "upper lid", "inner corner", "lower l
 NAMES = ("pupil_ellipse", "confidence", "gaze", "pupil_mm", "lid_opening")
 PARTS = ("image", "pupil", "iris", "lids", "gaze", "gaze_deg", "centres_mm", "pupil_mm", "lid_opening", "camera")
 AUGMENT = Augment(flip=0.0, scale=(0.7, 1.5), roll_deg=20.0)
+MOVED = {  # people_two_cameras in another headset: the camera 3 mm and 5 deg aside, another lens, exposure and lamps
+    "position_mm: [{var: forward}, ": "position_mm: [{var: forward + 2.1}, ",
+    "{var: -below}]": "{var: -below - 2.1}]",
+    "look_at_mm: [-4, -31.5, 0]": "look_at_mm: [-4, -31.5, 2.5]",
+    "look_at_mm: [-4, 31.5, 0]": "look_at_mm: [-4, 31.5, 2.5]",
+    "low: 140, high: 195": "low: 110, high: 135",
+    "exposure_ms: 2\n": "exposure_ms: 1.2\n",
+    "position_mm: [17, ": "position_mm: [14, ",
+}
 GRID = np.array([(x, y) for y in (-15, 0, 15) for x in (-20, 0, 20)], dtype=float)  # of the calibration, deg
 Arrays = dict[str, torch.Tensor]
 Floats = NDArray[np.float64]
@@ -403,10 +412,21 @@ def pupil_in(network: GazeNetwork, picture: NDArray[np.uint8]) -> Floats:
     return np.array([(x - left + 0.5) / scale - 0.5, (y - top + 0.5) / scale - 0.5, a / scale, b / scale, angle])
 
 
+def write_moved(path: Path) -> None:
+    """Write the dataset spec of a headset that the network does not know."""
+    text = find_dataset("people_two_cameras").read_text(encoding="utf-8")
+    for old, new in MOVED.items():
+        if old not in text:
+            raise RuntimeError(f"the recipe has no {old!r}")
+        text = text.replace(old, new)
+    path.write_text(text, encoding="utf-8")
+
+
 def main() -> int:
     """Train, test, report and export."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="+", help="datasets for training")
+    parser.add_argument("folders", type=Path, nargs="*", help="datasets for training")
+    parser.add_argument("--write-moved", type=Path, help="only write the dataset spec of another headset to this file")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="datasets of other people and rigs")
     parser.add_argument("--onnx", type=Path, help="write the first network to this file")
     parser.add_argument("--seeds", type=int, default=1, help="number of networks, which start from other weights")
@@ -415,6 +435,11 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path, help="the folder of labelled pictures of your own")
     parser.add_argument("--ellipses", type=Path, help="the table of their labels (CSV)")
     options = parser.parse_args()
+    if options.write_moved is not None:
+        write_moved(options.write_moved)
+        return 0
+    if not options.folders:
+        refuse("name a dataset for training")
     torch.manual_seed(0)
     start, cpu = time.monotonic(), time.process_time()
     try:
