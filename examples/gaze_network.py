@@ -9,10 +9,10 @@ finds the pupil's ellipse, the line of sight, the openness of the lids, the pupi
     small="--size 128x128 --spp 4"
     eyerender generate people_two_cameras -o out/two --subjects 400 --count 400 --seed 61 --splits train=1 $small
     eyerender generate people_any_headset -o out/any --subjects 600 --count 600 --seed 71 --splits train=1 $small
-    eyerender generate people_two_cameras -o out/people --subjects 10 --count 200 --seed 62 --splits test=1 $small
-    eyerender generate people_any_headset -o out/rigs --subjects 10 --count 200 --seed 72 --splits test=1 $small
+    eyerender generate people_two_cameras -o out/people --subjects 20 --count 400 --seed 64 --splits test=1 $small
+    eyerender generate people_any_headset -o out/rigs --subjects 20 --count 400 --seed 74 --splits test=1 $small
     python examples/gaze_network.py --write-moved moved.yaml
-    eyerender generate moved.yaml -o out/moved --subjects 10 --count 200 --seed 63 --splits test=1 $small
+    eyerender generate moved.yaml -o out/moved --subjects 20 --count 400 --seed 65 --splits test=1 $small
     python examples/gaze_network.py out/two out/any --test out/people out/rigs out/moved --onnx gaze.onnx
 
 The network is trained on the split ``train`` of the first folders and tested on the split ``test`` of the others, whose
@@ -137,7 +137,7 @@ def read(folders: list[Path], split: str, augment: Augment | None = None, copies
     options: dict[str, Any] = {"parts": PARTS, "size": (SIZE, SIZE), "mirror_left": True, "augment": augment}
     data: Any = ConcatDataset([FolderDataset(folder, split=split, **options) for folder in folders])
     loader: DataLoader[Any] = DataLoader(data, batch_size=64)
-    return joined([with_targets(batch) for _ in range(copies) for batch in loader])
+    return joined([upright(with_targets(batch)) for _ in range(copies) for batch in loader])
 
 
 def joined(batches: list[Arrays]) -> Arrays:
@@ -174,8 +174,41 @@ def with_targets(batch: dict[str, Any]) -> Arrays:
         "seen": seen.float()[:, None],
         "subject": batch["subject"],
         "left": batch["mirrored"],
-        **{key: camera[key] for key in ("K", "R", "distortion", "fisheye")},
+        **{key: camera[key] for key in ("K", "R", "distortion", "fisheye", "mirrored")},
     }
+
+
+def upright(data: Arrays) -> Arrays:
+    """Turn pictures as an owner of a headset would: not mirrored, and by quarters so that the upper lid is above.
+
+    Distortion is taken to be radial, as that of the recipes is.
+    """
+    rows = data["mirrored"]
+    data["image"][rows] = data["image"][rows].flip(-1)
+    data["points"][rows, :, 0] *= -1
+    data["shape"][rows, 2] *= -1
+    data["gaze"][rows, 0] *= -1
+    data["camera_gaze"][rows, 0] *= -1
+    data["pupil"][rows, 0] = SIZE - 1 - data["pupil"][rows, 0]
+    data["K"][rows, 0, 2] = SIZE - 1 - data["K"][rows, 0, 2]
+    x, y = data["R"][:, :2, 2].unbind(-1)  # of the upward direction, in the picture
+    quarters = torch.where(x.abs() > y.abs(), 2 - x.sign(), 1 + y.sign())
+    for least in (1, 2, 3):
+        rows = quarters >= least
+        data["image"][rows] = data["image"][rows].rot90(1, (-2, -1))
+        data["shape"][rows, 1:] *= -1
+        for key in ("points", "gaze", "camera_gaze"):
+            data[key][rows] = quarter(data[key][rows])
+        data["R"][rows] = quarter(data["R"][rows].mT).mT
+        data["K"][rows, :2, 2] = quarter(data["K"][rows, :2, 2] - (SIZE - 1) / 2) + (SIZE - 1) / 2
+        data["K"][rows, :2, :2] = data["K"][rows, :2, :2].flip(-1, -2)
+        data["pupil"][rows, :2] = quarter(data["pupil"][rows, :2] - (SIZE - 1) / 2) + (SIZE - 1) / 2
+    return data
+
+
+def quarter(vectors: torch.Tensor) -> torch.Tensor:
+    """Turn vectors (..., 2) or (..., 3) by a quarter in the plane of the picture, counter-clockwise on the screen."""
+    return torch.stack([vectors[..., 1], -vectors[..., 0], *vectors[..., 2:].unbind(-1)], dim=-1)
 
 
 def loss_of(network: GazeNetwork, batch: Arrays) -> torch.Tensor:
