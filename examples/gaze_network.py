@@ -10,9 +10,9 @@ finds the pupil's ellipse, the line of sight, the openness of the lids, the pupi
     eyerender generate people_two_cameras -o out/two --subjects 400 --count 400 --seed 61 --splits train=1 $small
     eyerender generate people_any_headset -o out/any --subjects 600 --count 600 --seed 71 --splits train=1 $small
     eyerender generate people_two_cameras -o out/people --subjects 20 --count 400 --seed 64 --splits test=1 $small
-    eyerender generate people_any_headset -o out/rigs --subjects 20 --count 400 --seed 74 --splits test=1 $small
+    eyerender generate people_any_headset -o out/rigs --subjects 10 --count 200 --seed 72 --splits test=1 $small
     python examples/gaze_network.py --write-moved moved.yaml
-    eyerender generate moved.yaml -o out/moved --subjects 20 --count 400 --seed 65 --splits test=1 $small
+    eyerender generate moved.yaml -o out/moved --subjects 10 --count 200 --seed 63 --splits test=1 $small
     python examples/gaze_network.py out/two out/any --test out/people out/rigs out/moved --onnx gaze.onnx
 
 The network is trained on the split ``train`` of the first folders and tested on the split ``test`` of the others, whose

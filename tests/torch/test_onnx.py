@@ -126,3 +126,15 @@ def test_the_example_trains_tests_and_writes_a_network_that_the_benchmark_takes(
     failed = subprocess.run([*script[:2], tmp_path / "none"], capture_output=True, text=True, check=False)
     assert failed.returncode == 2
     assert len(failed.stderr.splitlines()) == 1
+
+
+def test_the_shipped_weights_are_small_and_run_as_an_extractor():
+    path = ROOT / "examples" / "weights" / "gaze.onnx"
+    assert path.stat().st_size < 400_000
+    found = load_network(str(path))
+    assert found.size == (128, 128)
+    y, x = np.mgrid[:240, :240]
+    picture = np.where(np.hypot(x - 130, y - 120) < 12, 10, np.where(np.hypot(x - 130, y - 120) < 36, 80, 150))
+    pupil = found(picture.astype(np.uint8), {"bit_depth": 8})["pupil"]
+    assert pupil["status"] == "ok"
+    assert np.hypot(pupil["centre_px"][0] - 130, pupil["centre_px"][1] - 120) < 6
