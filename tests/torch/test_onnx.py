@@ -9,12 +9,14 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from eyerender.apps.benchmark.network import load_network
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from tests.support.paths import ROOT
 
+torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
@@ -138,3 +140,33 @@ def test_the_shipped_weights_are_small_and_run_as_an_extractor():
     pupil = found(picture.astype(np.uint8), {"bit_depth": 8})["pupil"]
     assert pupil["status"] == "ok"
     assert np.hypot(pupil["centre_px"][0] - 130, pupil["centre_px"][1] - 120) < 6
+
+
+def test_the_example_turns_pictures_upright_with_their_labels(monkeypatch):
+    """Each quarter turn, mirrored or not: the bright pixel stays at the pupil, and the gaze in the world stays the same."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import gaze_network as example
+
+    rng, count = np.random.default_rng(0), 8
+    turns = [Rotation.from_euler("z", 90 * k + 20, degrees=True).as_matrix() for k in range(4)] * 2
+    ahead = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]])  # up in the world is up in the picture
+    mirrored = torch.arange(count) >= 4
+    gaze = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(count, 3))), dim=-1)
+    column, row = rng.integers(example.SIZE, size=(2, count))
+    image = torch.zeros(count, 1, example.SIZE, example.SIZE)
+    image[torch.arange(count), 0, row, column] = 1
+    pixels = torch.tensor(np.stack([column, row], axis=-1)).double()
+    K = torch.tensor([[100.0, 0, 50], [0, 110, 70], [0, 0, 1]]).repeat(count, 1, 1)
+    R = torch.tensor(np.array(turns) @ ahead)
+    data = {"image": image, "mirrored": mirrored, "R": R.clone(), "K": K, "camera_gaze": gaze.clone(),
+            "gaze": gaze.clone(), "shape": torch.zeros(count, 3), "pupil": pixels.repeat(1, 3)[:, :5].clone(),
+            "points": ((pixels + 0.5) * 2 / example.SIZE - 1)[:, None].clone()}  # fmt: skip
+    own = gaze * torch.where(mirrored[:, None], torch.tensor([-1.0, 1, 1]), 1)
+    found = example.upright(data)
+    x, y = found["pupil"][:, :2].long().unbind(-1)
+    assert (found["image"][torch.arange(count), 0, y, x] == 1).all()
+    torch.testing.assert_close((found["points"][:, 0] + 1) * example.SIZE / 2 - 0.5, found["pupil"][:, :2])
+    torch.testing.assert_close(
+        (found["R"].mT @ found["camera_gaze"][..., None])[..., 0], (R.mT @ own[..., None])[..., 0]
+    )
+    assert (found["R"][:, 1, 2] < -0.9).all()
