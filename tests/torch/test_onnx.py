@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -143,9 +144,9 @@ def test_the_shipped_weights_are_small_and_run_as_an_extractor():
 
 
 def test_the_example_turns_pictures_upright_with_their_labels(monkeypatch):
-    """Each quarter turn, mirrored or not: the bright pixel stays at the pupil, and the gaze in the world stays the same."""
+    """Each quarter turn, mirrored or not: the bright pixel stays at the pupil, and the gaze in the world is the same."""
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
-    import gaze_network as example
+    example = importlib.import_module("gaze_network")
 
     rng, count = np.random.default_rng(0), 8
     turns = [Rotation.from_euler("z", 90 * k + 20, degrees=True).as_matrix() for k in range(4)] * 2
