@@ -144,7 +144,7 @@ def test_the_shipped_weights_are_small_and_run_as_an_extractor():
 
 
 def test_the_example_turns_pictures_upright_with_their_labels(monkeypatch):
-    """Each quarter turn, mirrored or not: the bright pixel stays at the pupil, and the gaze in the world is the same."""
+    """Each quarter turn, mirrored or not: the bright pixel stays at the pupil, the gaze in the world is the same."""
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     example = importlib.import_module("gaze_network")
 
