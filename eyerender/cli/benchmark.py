@@ -39,8 +39,8 @@ def bench_extractors(
         folder: A folder of labelled images: written by quickstart, render or generate, your own with labels.csv or
             masks, or in the layout of OpenEDS, TEyeD, COCO, LPW or ExCuSe. With --film: a video, or a folder.
         extractor: The name of an installed extractor (own-fast, own-refined, opencv-contour, pupil-detectors, or a
-            plug-in), a Python module:callable, or a command that speaks the protocol. NAME=... names it in the report.
-            Repeat the option for several extractors (default: all installed ones).
+            plug-in), a Python module:callable, onnx:FILE for a network, or a command that speaks the protocol. NAME=...
+            names it in the report. Repeat the option for several extractors (default: all installed ones).
     """
     from ..apps.benchmark.run import REPORT, TIMES, bench_extractors
 

@@ -158,6 +158,24 @@ def _texture_seeds() -> list[bytes]:
     return png_seeds()
 
 
+NETWORK = (  # of one picture of 2 x 2 px; the ellipse is its mean times five ones
+    b'\x08\x08:\xbf\x01\n,\n\x01i\x12\nconfidence"\nReduceMean*\x0f\n\x08keepdims\x18\x00\xa0\x01\x02'
+    b'\n#\n\nconfidence\n\x01c\x12\rpupil_ellipse"\x03Mul\x12\x01g'
+    b"*\x1f\x08\x01\x08\x05\x10\x01B\x01cJ\x14\x00\x00\x80?\x00\x00\x80?\x00\x00\x80?\x00\x00\x80?\x00\x00\x80?Z\x1b\n\x01i\x12\x16\n\x14\x08\x01\x12\x10\n\x02\x08\x01\n\x02\x08\x01\n\x02\x08\x02\n\x02\x08\x02"
+    b"b\x15\n\rpupil_ellipse\x12\x04\n\x02\x08\x01b\x12\n\nconfidence\x12\x04\n\x02\x08\x01B\x04\n\x00\x10\x11r\x16\n\teyerender\x12\tnetwork/1"
+)
+
+
+def _network(path: Path) -> Any:
+    from eyerender.apps.benchmark.network import load_network
+
+    return load_network(str(path))
+
+
+def _network_seeds() -> list[bytes]:
+    return [NETWORK]
+
+
 def _against(path: Path) -> Any:
     from eyerender.apps.benchmark.checks import compare_with, read_results
     from tests.support.fuzzing import strict_json
@@ -277,6 +295,7 @@ SMALL: dict[str, Reader] = {
     "manifest": Reader("a.json", _manifest, _seeds(MANIFEST)),
     "texture": Reader("a.png", _texture, _texture_seeds),
     "results": Reader("a.json", _against, _results_seeds),
+    "network": Reader("a.onnx", _network, _network_seeds),
     "signs": Reader("a.json", _signs, _seeds(STUDY, {"schema": "eyerender/folder/1", "files": ["a", "b/"]})),
     "sweep-mark": Reader("sweep.json", _sweep_mark, _sweep_seeds),
     "rate": Reader("a.json", _rate, _seeds({"format": "eyerender/rate/2", **RATE})),

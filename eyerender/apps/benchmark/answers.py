@@ -23,7 +23,7 @@ from ...base.storage.files import MAX_FILE_BYTES, appended, parse_json, read_byt
 from ...folders.imagefolder import versions
 from ...folders.outfolder import mark
 from .labelled import BenchImage
-from .registry import WORKER, ExtractorCommand
+from .registry import PREFIX, WORKER, ExtractorCommand
 
 ANSWERS = "answers.jsonl"
 _SCHEMA = "eyerender/bench-answers/1"
@@ -84,17 +84,18 @@ def task_of(extractors: Sequence[ExtractorCommand], code: Sequence[str], keys: S
 
 
 def code_digest(extractor: ExtractorCommand, timeout_s: float) -> str:
-    """Compute the SHA-256 of an extractor's code; a `module:callable` is loaded, in a separate process.
+    """Compute the SHA-256 of an extractor's code; a `module:callable` or network is loaded, in a separate process.
 
     Returns:
         The digest; "" if its process failed for another reason, which the benchmark then reports.
 
     Raises:
-        InputError: there is no such module or callable.
+        InputError: there is no such module or callable, or the network cannot be used.
     """
-    if extractor.argv[2:4] != ("-m", WORKER) or not is_reference(extractor.argv[4]):
-        return _digest([path for word in extractor.argv if (path := Path(shutil.which(word) or word)).is_file()])
-    reference = extractor.argv[4]
+    argv = extractor.argv
+    if argv[2:4] != ("-m", WORKER) or not (is_reference(argv[4]) or argv[4].startswith(PREFIX)):
+        return _digest([path for word in argv if (path := Path(shutil.which(word) or word)).is_file()])
+    reference = argv[4]
     if reference.startswith("eyerender."):
         return _digest(sorted(_PACKAGE.rglob("*.py")))
     try:

@@ -1,4 +1,4 @@
-"""The available extractors: installed names, Python callables, commands."""
+"""The available extractors: installed names, Python callables, networks, commands."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from ...base.references import is_reference
 
 GROUP = "eyerender.extractors"
 WORKER = "eyerender.apps.benchmark.worker"
+PREFIX = "onnx:"
+"""What stands before the file of a network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,7 @@ def names() -> tuple[str, ...]:
 
 
 def resolve(given: str) -> ExtractorCommand:
-    """Resolve an entry-point name, `module:callable` or a command line, each optionally after `LABEL=`.
+    """Resolve an entry-point name, `module:callable`, `onnx:FILE` or a command line, each optionally after `LABEL=`.
 
     Raises:
         InputError: the reference is none of these, or the program does not exist.
@@ -52,6 +54,9 @@ def resolve(given: str) -> ExtractorCommand:
     installed = _installed()
     if spec in installed:
         return _of_entry_point(name or spec, given, installed[spec])
+    if spec.startswith(PREFIX):
+        title = name or Path(spec.removeprefix(PREFIX)).stem or spec
+        return ExtractorCommand(title, given, tuple(python_command(WORKER, spec, title)))
     if is_reference(spec):
         title = name or spec
         return ExtractorCommand(title, given, tuple(python_command(WORKER, spec, title)))
@@ -62,7 +67,8 @@ def resolve(given: str) -> ExtractorCommand:
     if not argv or shutil.which(argv[0]) is None:
         known = ", ".join(sorted(installed))
         raise InputError(
-            f"{given!r} is neither an extractor ({known}) nor a module:callable nor a command", source="--extractor"
+            f"{given!r} is neither an extractor ({known}) nor a module:callable, onnx:FILE or a command",
+            source="--extractor",
         )
     return ExtractorCommand(name or Path(argv[0]).name, given, tuple(argv))
 

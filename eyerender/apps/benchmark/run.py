@@ -52,9 +52,9 @@ def bench_extractors(
     Args:
         folder: the labelled images.
         output: the folder that receives the results.
-        extractors: an installed name, `module:callable` (see `Extractor`), or a command line, each optionally after
-            `NAME=`; names must differ. By default all installed ones; the results list those that cannot run here, with
-            the reason.
+        extractors: an installed name, `module:callable` (see `Extractor`), `onnx:FILE`, or a command line, each
+            optionally after `NAME=`; names must differ. By default all installed ones; the results list those that
+            cannot run here, with the reason.
         options: jobs, time limits, checks and the like.
         progress: called with (answers, answers in all, note).
         changes: fields of `BenchOptions` by name, instead of those of `options`.

@@ -1,5 +1,7 @@
 """Run a Python callable behind the protocol: `python -m eyerender.apps.benchmark.worker module:callable [NAME]`.
 
+`onnx:FILE` in place of the callable runs a network (`network.py`).
+
 With `--check` first, the callable is only loaded: the files of its code are printed as a JSON list, or the exit code is
 2 if there is no such callable.
 
@@ -22,7 +24,7 @@ from ...base.references import load_reference
 from ...folders.imagefile import read_any_image
 from .conventions import Conventions
 from .protocol import FEATURES, SCHEMA, Extractor
-from .registry import Command
+from .registry import PREFIX, Command
 
 
 def main(argv: list[str]) -> int:
@@ -34,7 +36,7 @@ def main(argv: list[str]) -> int:
     if argv[0] == "--check":
         return _check(argv[1], os.fdopen(stdout, "w", encoding="utf-8"))
     try:
-        found = load_reference(argv[0])
+        found = _loaded(argv[0])
     except InputError as error:
         raise SystemExit(str(error)) from None
     if isinstance(found, Command):
@@ -75,13 +77,16 @@ def main(argv: list[str]) -> int:
 def _check(reference: str, answers: TextIO) -> int:
     """Load a callable, and print the files of its module and of other modules outside installed packages."""
     try:
-        found = load_reference(reference)
+        found = _loaded(reference)
     except InputError as error:
         sys.stderr.write(f"{error}\n")
         return 2
     if not callable(found) and not isinstance(found, Command):
         sys.stderr.write(f"{reference} is neither a callable nor a Command\n")
         return 2
+    if reference.startswith(PREFIX):
+        _send(answers, json.dumps([os.path.abspath(reference.removeprefix(PREFIX))]))
+        return 0
     installed = (sys.prefix, sys.base_prefix)
     files = {
         name: file
@@ -93,6 +98,15 @@ def _check(reference: str, answers: TextIO) -> int:
     }
     _send(answers, json.dumps(sorted(os.path.abspath(file) for file in own)))
     return 0
+
+
+def _loaded(reference: str) -> Any:
+    """Load a network or `module:callable`."""
+    if reference.startswith(PREFIX):
+        from .network import load_network
+
+        return load_network(reference.removeprefix(PREFIX))
+    return load_reference(reference)
 
 
 def _send(stream: TextIO, line: str) -> None:
