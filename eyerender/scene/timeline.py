@@ -103,7 +103,7 @@ def _course(keyed: _Keyed) -> MovingEyes:
     try:
         if isinstance(sequence.gaze, GazeModel):
             sequence = sequence.model_copy(update={"gaze": sequence.gaze.placed(scene.rig.screen)})
-        return sequence.build(_aim(scene), Habits.drawn(who), resting)
+        return MovingEyes.of(sequence, _aim(scene), Habits.drawn(who), resting)
     except ValueError as error:
         raise InputError(str(error), path="sequence.gaze") from None
     except InputError as error:

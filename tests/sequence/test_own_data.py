@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from eyerender.base.errors import InputError
+from eyerender.scene.sequence.course import MovingEyes
 from eyerender.scene.sequence.habits import Habits
 from eyerender.scene.sequence.spec import Sequence
 from tests.sequence.test_motion import aim
@@ -15,7 +16,7 @@ GAZE = "time_ms,x,y,torsion_deg\n0,-5,1,0\n50,nan,nan,0\n100,5,1,2\n"
 
 
 def built(spec):
-    return spec.build(aim, Habits.drawn((0,)), np.array([4.0, 4.0]))
+    return MovingEyes.of(spec, aim, Habits.drawn((0,)), np.array([4.0, 4.0]))
 
 
 def write(folder, name, text):
@@ -75,7 +76,7 @@ def test_files_of_too_many_rows_and_unknown_columns_are_refused(tmp_path):
     lids = write(tmp_path, "l.csv", "time_s,blink\n" + 20_001 * "0,0\n")
     with pytest.raises(InputError, match="has more than 20000 rows"):
         Sequence.from_mapping({"lids": lids}).resolved(tmp_path)
-    with pytest.raises(InputError, match="columns.blnk: must be one of time_s, blink, squint, wide"):
+    with pytest.raises(InputError, match=r"columns\.blnk: must be one of time_s, blink, squint, wide"):
         Sequence.from_mapping({"lids": {**lids, "columns": {"blnk": "b"}}}).resolved(tmp_path)
 
 

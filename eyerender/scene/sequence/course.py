@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from ...base.arrays import Floats, Statuses
 from ...eye.pose import listing_torsion
 from ...population.pupil import watson_yellott_mm
-from .gaze import BEFORE_S, STEP_S, Carrier, GazeCourse, Looking, model_course, table_course
+from .gaze import BEFORE_S, STEP_S, GazeCourse, Looking, model_course, table_course
 from .habits import Habits
 from .spec import (
-    Aim,
+    Aiming,
     GazeModel,
     GazeTable,
     HeadModel,
@@ -63,12 +64,13 @@ class MovingEyes:
         )
 
     @classmethod
-    def of(cls, sequence: Sequence, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
+    def of(cls, sequence: Sequence, aim: Aiming, habits: Habits, resting_mm: Floats) -> MovingEyes:
         """Make a sequence's courses on the grid.
 
         Raises:
             InputError: an eye cannot look at a target.
         """
+        sequence = sequence.resolved()
         count = round((sequence.duration_s + 2 * BEFORE_S) / STEP_S) + 2
         times = np.asarray(STEP_S * np.arange(count) - BEFORE_S, dtype=np.float64)
         seed = (sequence.seed & 0xFFFFFFFF, sequence.seed >> 32)
@@ -145,7 +147,7 @@ class MovingEyes:
         return np.repeat(closure[:, None], 2, axis=1), nothing, nothing
 
 
-def _carried(turn_rad: Floats, shift_mm: Floats) -> Carrier | None:
+def _carried(turn_rad: Floats, shift_mm: Floats) -> Callable[[Floats], Floats] | None:
     """Return what moves targets with the rig; None if it is still."""
     if not (turn_rad.any() or shift_mm.any()):
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -15,14 +15,10 @@ from ...base.spec import NonNegative, Number, Positive, Spec, Vec2, Vec3
 from ...rig.screen import ScreenPlane
 from .files import MAX_ROWS, read_columns, read_times
 
-if TYPE_CHECKING:
-    from .course import MovingEyes
-    from .habits import Habits
-
-Share = Annotated[float, Field(ge=0, le=1)]
+Closure = Annotated[float, Field(ge=0, le=1)]
 Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=MAX_ROWS)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
-Aim = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
+Aiming = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
 """Turns an eye (0 right, 1 left) towards targets (k, 3) mm with the head at (k, 3) mm: azimuth and elevation, rad."""
 
 
@@ -163,7 +159,7 @@ class GazeModel(Spec):
     microsaccades_per_s: Annotated[float, Field(ge=0, le=5)] = Field(
         default=1.0, description="rate of microsaccades, 0.1 to 1 degree (1 to 2 per second)"
     )
-    pursuit_share: Share = Field(default=0.0, description="share of the fixations whose target moves")
+    pursuit_share: Closure = Field(default=0.0, description="share of the fixations whose target moves")
     pursuit_deg_s: Annotated[float, Field(ge=0, le=40)] = Field(default=10.0, description="speed of these targets")
     oscillation: bool = Field(default=True, description="whether the pupil oscillates in the eye after saccades")
     torsion_deg: Annotated[
@@ -200,9 +196,9 @@ class GazeModel(Spec):
 class LidTable(_Table):
     """The user's own lids."""
 
-    blink: tuple[Share, ...] = Field(description="closure of the lids, 0 to 1")
-    squint: tuple[Share, ...] | None = Field(default=None, description="lower lid raised")
-    wide: tuple[Share, ...] | None = Field(default=None, description="upper lid raised above its rest")
+    blink: tuple[Closure, ...] = Field(description="closure of the lids, 0 to 1")
+    squint: tuple[Closure, ...] | None = Field(default=None, description="lower lid raised")
+    wide: tuple[Closure, ...] | None = Field(default=None, description="upper lid raised above its rest")
 
 
 class LidModel(Spec):
@@ -214,7 +210,7 @@ class LidModel(Spec):
     blinks_per_minute: Annotated[float, Field(ge=0, le=120)] | None = Field(
         default=None, description="mean rate of spontaneous blinks, whose intervals are log-normal; default: the task's"
     )
-    complete_share: Share = Field(
+    complete_share: Closure = Field(
         default=0.47, description="share of blinks that shut the eye (52.9 % of 1,414 are partial, Ousler et al. 2014)"
     )
     at_s: tuple[NonNegative, ...] = Field(default=(), description="voluntary, complete blinks begin at these times")
@@ -426,18 +422,3 @@ class Sequence(Spec):
         except InputError as error:
             raise error if error.source else error.placed(under=key) from None
         return self.model_copy(update=changes) if changes else self
-
-    def build(self, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
-        """Make all that is drawn and solved once.
-
-        Args:
-            aim: turns an eye towards targets.
-            habits: those of the person.
-            resting_mm: (2,) diameters of the stops, right and left.
-
-        Raises:
-            InputError: an eye cannot look at a target.
-        """
-        from .course import MovingEyes
-
-        return MovingEyes.of(self.resolved(), aim, habits, resting_mm)
