@@ -1,19 +1,18 @@
 #!/usr/bin/env python3
-"""Bench of sequences: what drawn eyes do, against what is published, and what a detector of events finds in it.
+"""Bench of drawn motion: each source of motion of a sequence against what is published, and its cost.
 
-    bench_sequences.py [--quick] [--json F] [--people N] [--seed S]
+    bench_motion.py [--quick] [--json F] [--people N] [--seed S]
 
 Rows named "z" are statistics of drawn traces against their sources, in standard errors over people. Peak velocity and
-skew are measured from traces of 24 people at 1,000 Hz, as a laboratory does, and compared with Collewijn, Erkelens and
-Steinman (1988); the oscillation of the pupil with the range of 0.2 to 1 degree of apparent gaze after 10 degrees, at 12
-degrees per mm. Where REMoDNaV is installed (`pip install remodnav`), it detects saccades of 1 degree and more.
+skew are measured from traces at 1,000 Hz, as a laboratory does, and compared with Collewijn, Erkelens and Steinman
+(1988); the oscillation of the pupil with the range of 0.2 to 1 degree of apparent gaze after 10 degrees, at 12 degrees
+per mm.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,7 +23,6 @@ single_threaded()
 import numpy as np
 
 from eyerender.base.arrays import Floats
-from eyerender.scene.observation import WHITE, correlated
 from eyerender.scene.sequence.course import MovingEyes
 from eyerender.scene.sequence.habits import Habits
 from eyerender.scene.sequence.saccades import acceleration_share
@@ -188,64 +186,6 @@ def rigs(people: range) -> Iterator[Row]:
     yield z("variance of the rig after 10 jumps of 0.5 mm, mm2", jumps_mm, 10 * 0.5**2)
 
 
-def detected(people: range) -> Iterator[Row]:
-    """Yield F1 of REMoDNaV on saccades of 1 degree and more."""
-    try:
-        import remodnav  # noqa: F401
-    except ImportError:
-        print("REMoDNaV is not installed")
-        return
-    cases: list[tuple[str, float, bool, float, float, float | None]] = [
-        ("no noise", rate, False, 0.0, WHITE, 0.95) for rate in (500.0, 1000.0)
-    ]
-    cases += [("oscillation", rate, True, 0.0, WHITE, None) for rate in (500.0, 1000.0)]
-    for s2s in (0.02, 0.2):
-        cases += [
-            (f"type {kind:.2f}, RMS-S2S {s2s:g} deg", 1000.0, False, s2s, kind, None) for kind in (WHITE, 0.9, 0.4)
-        ]
-    for name, rate, rings, s2s, kind, must in cases:
-        counts = np.zeros(3)
-        for person in people:
-            states = moved(person, 30.0, rate, gaze={"oscillation": rings, "microsaccades_per_s": 0})
-            gaze = np.degrees(np.stack([states.azimuth_rad[:, 0], states.elevation_rad[:, 0]], axis=-1))
-            seen = gaze + DEG_PER_MM * states.stop_shift_mm[:, 0]
-            white = np.random.default_rng(person).standard_normal(seen.shape)
-            counts += matched(
-                gaze, runs(states.events[:, 2]), found_by_remodnav(seen + s2s / kind * correlated(white, kind), rate)
-            )
-        hits, missed, wrong = counts
-        text = f"F1 of REMoDNaV at {rate:g} Hz, {name}"
-        yield row(text, 2 * hits / (2 * hits + missed + wrong), "", must, at_least=True)
-
-
-def found_by_remodnav(gaze_deg: Floats, rate_hz: float) -> list[tuple[float, float]]:
-    """Return the first and last samples of saccades that REMoDNaV finds, with its default settings."""
-    from remodnav import EyegazeClassifier
-
-    data = np.rec.fromarrays(list(100.0 * gaze_deg.T), names=["x", "y"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        classifier = EyegazeClassifier(px2deg=0.01, sampling_rate=rate_hz)
-        events = classifier(classifier.preproc(data))
-    kinds = ("SACC", "ISAC")
-    return [(e["start_time"] * rate_hz, e["end_time"] * rate_hz) for e in events if e["label"] in kinds]
-
-
-def matched(gaze_deg: Floats, drawn: list[tuple[int, int]], found: list[tuple[float, float]]) -> Floats:
-    """Count hits, misses and false alarms (3,).
-
-    A hit overlaps the drawn saccade; what overlaps one below 1 degree does not count.
-    """
-    hits = missed = 0
-    free = list(found)
-    for begin, end in drawn:
-        here = [one for one in free if min(end, one[1]) > max(begin, one[0])]
-        free = [one for one in free if one not in here[:1]]
-        if np.linalg.norm(gaze_deg[min(end, len(gaze_deg) - 1)] - gaze_deg[begin]) >= 1.0:
-            hits, missed = hits + bool(here), missed + (not here)
-    return np.array([hits, missed, len(free)], dtype=float)
-
-
 def costs() -> Iterator[Row]:
     """Yield CPU seconds of making a sequence of 10 s, and of 20,000 states."""
     rows = []
@@ -263,7 +203,7 @@ def costs() -> Iterator[Row]:
 
 def main() -> int:
     """Run the bench."""
-    parser = options_of(__doc__, "8 people, and 2 for REMoDNaV")
+    parser = options_of(__doc__, "8 people in place of 24")
     parser.add_argument("--people", type=int, default=24, help="number of people (24)")
     parser.add_argument("--seed", type=int, default=0, help="number of the first person (0)")
     options = parser.parse_args()
@@ -271,7 +211,6 @@ def main() -> int:
     report = Report()
     for rows in (costs(), saccades(people), fixations(people), blinks(people), pupils(people), rigs(people)):
         report.extend(rows)
-    report.extend(detected(people[: 2 if options.quick else 6]))
     return report.finish(options.json, ("numpy", "scipy"))
 
 
