@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..base.arrays import Floats, Indices, Ints
+from ..base.arrays import Floats, Indices, Ints, remembered
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import stack_stops
 from ..eye.build import fitting_stop
-from ..eye.fixation import fixations
+from ..eye.fixation import fixations, with_torsion
 from ..eye.model import EyeModel, Stop
 from ..eye.spec import EyeSpec
 from ..rig.rig import RigGeometry
@@ -74,6 +74,7 @@ class TimedScene(Protocol):
         ...
 
 
+@remembered
 def course_of(scene: TimedScene) -> MovingEyes:
     """Return the course of a scene's sequence; scenes that differ in other things share it."""
     spec, rest = scene.spec, scene.spec.to_mapping()
@@ -129,7 +130,11 @@ def _aim(scene: TimedScene) -> Callable[[Floats, Floats, int], tuple[Floats, Flo
             target = ", ".join(f"{v:.4g}" for v in targets_mm[bad[0]])
             reason = found.reason(int(bad[0]))
             raise InputError(f"the {EYES[eye]} eye cannot fixate ({target}) mm: {reason}", path="gaze")
-        return found.poses.azimuth_rad, found.poses.elevation_rad
+        poses, torsion = found.poses, scene.spec.sequence.gaze.torsion_deg if scene.spec.sequence else 0.0
+        if isinstance(torsion, float) and torsion:
+            extra = np.full(len(targets_mm), np.radians(torsion))
+            poses = with_torsion([scene.eye(side)], which, found, targets_mm - base - head_mm, extra)
+        return poses.azimuth_rad, poses.elevation_rad
 
     return aim
 
