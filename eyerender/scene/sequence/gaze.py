@@ -192,7 +192,7 @@ def _with_saccades(
     lasting = np.where(size > 0.01, duration_s(size) * habits.duration, 0.0)
     ends = fixations.begin_s + lasting
     passed = (times_s - fixations.begin_s[number]) / np.maximum(lasting[number], 1e-9)
-    left = 1.0 - progress(passed, acceleration_share(size)[number])
+    left = 1.0 - progress(passed, habits.skew * acceleration_share(size)[number])
     return wanted - left[:, None, None] * jump[number], ends, size
 
 
