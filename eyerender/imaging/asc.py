@@ -66,7 +66,7 @@ def asc_text(trace: Trace, screen_px: tuple[int, int]) -> str:
 def _px_per_deg(display: Display, series: GazeSeries) -> Floats:
     """Return the pixels per degree, (2,), at the screen's middle."""
     away = np.linalg.norm(display.plane.centre_mm - series.origin_mm[0])
-    return np.radians(away) * display.px_per_mm
+    return np.asarray(np.radians(away) * display.px_per_mm)
 
 
 def _header(trace: Trace, eyes: Sequence[_Eye], screen_px: tuple[int, int]) -> Iterator[str]:

@@ -23,6 +23,16 @@ from .trace import Trace
 SCREEN_PX = (1920, 1080)
 
 
+def check_screen(screen_px: tuple[int, int]) -> None:
+    """Check the width and height of a screen's picture.
+
+    Raises:
+        InputError: a side is not 1 to 65,536 pixels.
+    """
+    if min(screen_px) < 1 or max(screen_px) > 65536:
+        raise InputError("must be 1 to 65536", source="--screen-px")
+
+
 class Display(NamedTuple):
     """A screen in the world, and the width and height of its picture in pixels."""
 
@@ -32,7 +42,7 @@ class Display(NamedTuple):
     @property
     def px_per_mm(self) -> Floats:
         """Pixels per mm, (2,) to the right and down."""
-        return np.array(self.size_px) / np.array(self.plane.size_mm)
+        return np.asarray(np.array(self.size_px) / np.array(self.plane.size_mm))
 
     def pixels(self, origin_mm: Floats, direction: Floats) -> Floats:
         """Return where rays (n, 3) meet the screen: (n, 2) px; NaN where it is not ahead."""
@@ -92,7 +102,7 @@ def has_event(events: Objects, word: str) -> Bools:
 def degrees_of(direction: Floats) -> Floats:
     """Return azimuth and elevation (n, 2) in degrees of unit vectors (n, 3) in the world."""
     x, y, z = direction.T
-    return np.degrees(np.stack([np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0))], axis=1))
+    return np.asarray(np.degrees(np.stack([np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0))], axis=1)))
 
 
 def places_of(origin_mm: Floats, direction: Floats, display: Display | None) -> Floats:
