@@ -67,7 +67,9 @@ def features(
     heed = Heed(strict)
     loaded = heed.scene(scene, eye=eye)
     if output is not None:
-        return _sampled(loaded, tracker, output, format, screen_px)
+        trace = _sampled(loaded, tracker, output, format, screen_px)
+        emit(trace, f"{output}: {trace['rows']} samples, {tracker.rate:g} per second", json, heed)
+        return 0
     frames = loaded.frames()
     observed, seen = AnalyticObserver(points).observe_in_detail(frames, purkinje=purkinje or (1,))
     data: dict[str, Any] = {
@@ -83,8 +85,8 @@ def features(
     return 0
 
 
-def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px: tuple[int, int]) -> int:
-    """Write the trace of a sequence; beside a table, its schema."""
+def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px: tuple[int, int]) -> dict[str, Any]:
+    """Write the trace of a sequence, and beside a table its schema, which is returned."""
     from ..base.storage.files import csv_text, refuse_special, write_json, write_text
     from ..folders.outfolder import refuse_non_empty, staged
     from ..imaging.asc import asc_text
@@ -106,8 +108,7 @@ def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px:
     else:
         write_text(output, csv_text(trace.header(), trace.rows()))
         write_json(output.with_name(output.name + ".json"), trace.to_mapping())
-    print(f"{output}: {len(trace.observations)} samples, {tracker.rate:g} per second")
-    return 0
+    return trace.to_mapping()
 
 
 @app.command(name="extract")

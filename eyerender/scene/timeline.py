@@ -103,7 +103,7 @@ def _course(keyed: _Keyed) -> MovingEyes:
     try:
         if isinstance(sequence.gaze, GazeModel):
             sequence = sequence.model_copy(update={"gaze": sequence.gaze.placed(scene.rig.screen)})
-        return sequence.build(_aim(scene), Habits.drawn(who), resting)
+        return MovingEyes.of(sequence, _aim(scene), Habits.drawn(who), resting)
     except ValueError as error:
         raise InputError(str(error), path="sequence.gaze") from None
     except InputError as error:
@@ -149,17 +149,17 @@ def _exposures(scene: TimedScene, timings: tuple[FrameTimes, ...]) -> _Exposures
     sequence = scene.spec.sequence
     assert sequence is not None
     used = [c for c, camera in enumerate(scene.rig.cameras) if any(map(camera.sees, scene.spec.subject.eyes))]
-    counts = {c: timings[c].frames_within(sequence.duration_s) for c in used}
-    if (count := sum(counts.values())) > MAX_OBSERVATIONS:
+    starts = {c: _starts_s(scene, timings[c]) for c in used}
+    if (count := sum(map(len, starts.values()))) > MAX_OBSERVATIONS:
         raise InputError(f"has {count} frames; a scene may have {MAX_OBSERVATIONS}", path="sequence.duration_s")
-    fastest = min(used, key=lambda c: timings[c].period_s)
-    middle = [_middle_s(timings[c], np.arange(counts[c])) for c in used]
+    fastest = min(used, key=lambda c: (-len(starts[c]), timings[c].period_s))
+    middle = [timings[c].ambient_s(starts[c], (timings[c].rows - 1) / 2) for c in used]
     reference = middle[used.index(fastest)]
     parts = []
     for c, own in zip(used, middle, strict=True):
         nearest = np.rint(np.interp(own, reference, np.arange(len(reference)))) if len(reference) > 1 else 0 * own
         number = np.arange(len(own))
-        parts.append((nearest.astype(np.int64), np.full(len(own), c), number, timings[c].start_s(number)))
+        parts.append((nearest.astype(np.int64), np.full(len(own), c), number, starts[c]))
     instant, camera, number, start = (np.concatenate(column) for column in zip(*parts, strict=True))
     chosen = np.ones(len(instant), bool) if sequence.instants is None else np.isin(instant, sequence.instants)
     if sequence.timestamps is not None and sequence.instants is None:
@@ -169,8 +169,14 @@ def _exposures(scene: TimedScene, timings: tuple[FrameTimes, ...]) -> _Exposures
     return _Exposures(instant[order], camera[order], number[order], start[order])
 
 
-def _middle_s(timing: FrameTimes, number: Ints) -> Floats:
-    return timing.ambient_s(timing.start_s(number), (timing.rows - 1) / 2)
+def _starts_s(scene: TimedScene, timing: FrameTimes) -> Floats:
+    """Return when (n,) a camera's frames begin: at the user's own times, or at its rate."""
+    sequence = scene.spec.sequence
+    assert sequence is not None
+    own = None if sequence.timestamps is None else sequence.timestamps.starts_s()
+    if own is None:
+        return timing.start_s(np.arange(timing.frames_within(sequence.duration_s)))
+    return timing.phase_s + own[own < sequence.duration_s]
 
 
 def instants_of(scene: TimedScene) -> int:
@@ -178,7 +184,7 @@ def instants_of(scene: TimedScene) -> int:
     assert scene.spec.sequence is not None
     timings = scene.timings
     used = [c for c, camera in enumerate(scene.rig.cameras) if any(map(camera.sees, scene.spec.subject.eyes))]
-    return max(timings[c].frames_within(scene.spec.sequence.duration_s) for c in used)
+    return max(len(_starts_s(scene, timings[c])) for c in used)
 
 
 def rows_in_time(scene: TimedScene) -> tuple[Index, PoseTruth]:

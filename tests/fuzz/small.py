@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -256,6 +257,27 @@ def _map_seeds() -> list[bytes]:
     return READERS["cached-map"].seeds()
 
 
+def _trace(path: Path) -> Any:
+    from eyerender.scene.sequence.spec import Sequence
+
+    names = {"azimuth_deg": "x", "elevation_deg": "y"}
+    return Sequence.from_mapping({"gaze": {"file": path.name, "columns": names}}).resolved(path.parent)
+
+
+def _stamps(path: Path) -> Any:
+    from eyerender.scene.sequence.spec import Sequence
+
+    found = Sequence.from_mapping({"timestamps": {"file": str(path)}}).timestamps
+    assert found is not None
+    return found.starts_s(), found.stored_s(np.zeros(1), np.zeros(1), np.zeros(1, dtype=int), np.zeros(1, dtype=int))
+
+
+def _stamps_seeds() -> list[bytes]:
+    file = BytesIO()
+    np.save(file, np.array([1234.5, 1234.51, 1234.54]))
+    return [file.getvalue()]
+
+
 STUDY = {"schema": "eyerender/study/1", "settings": {"study": 1}}
 SMALL: dict[str, Reader] = {
     "tolerances": Reader("a.yaml", _tolerances, lambda: [_TOLERANCES]),
@@ -282,5 +304,7 @@ SMALL: dict[str, Reader] = {
     "rate": Reader("a.json", _rate, _seeds({"format": "eyerender/rate/2", **RATE})),
     "verdict": Reader("a.json", _verdict, _seeds({"verdict": {"ok": True, "detail": "LLVM 19"}})),
     "answers": Reader("a.jsonl", _answers, _answers_seeds),
+    "sequence-trace": Reader("a.csv", _trace, lambda: [b"time_s,x,y,torsion_deg\n0,1,2,0\n0.5,,nan,0\n1,-3,4e-1,1\n"]),
+    "sequence-stamps": Reader("a.npy", _stamps, _stamps_seeds),
     "map-file": Reader("a.map", _map_file, _map_seeds),
 }

@@ -213,6 +213,6 @@ def test_a_sequence_that_contradicts_its_scene_is_refused(change, message):
 def test_a_pulse_must_fit_into_a_frame_and_agree_with_the_duty_cycle():
     with pytest.raises(InputError, match="ends after 12 ms, but a frame takes 10 ms"):
         in_time(led={"pulse": {"start_ms": 4.0, "width_ms": 8.0}})
-    with pytest.raises(InputError, match="the pulses and frame rates make 0.2"):
+    with pytest.raises(InputError, match=r"the pulses and frame rates make 0\.2"):
         in_time(led={"pulse": {"width_ms": 2.0}, "duty_cycle": 0.5})
     assert in_time(led={"pulse": {"width_ms": 2.0}}).rig.lights[0].duty_cycle == pytest.approx(0.2)

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from eyerender.scene.sequence import saccades
+from eyerender.scene.sequence.course import MovingEyes
 from eyerender.scene.sequence.habits import Habits
 from eyerender.scene.sequence.spec import Sequence
 
@@ -23,7 +24,7 @@ def aim(targets_mm, head_mm, eye):
 def course(seed=0, person=0, **keys):
     keys = {"duration_s": 20.0, "lids": {"blinks_per_minute": 0}, "pupil": {"hippus": 0}, **keys}
     spec = Sequence.from_mapping({"seed": seed, **keys})
-    return spec.build(aim, Habits.drawn((person,)), np.array([4.0, 4.2]))
+    return MovingEyes.of(spec, aim, Habits.drawn((person,)), np.array([4.0, 4.2]))
 
 
 QUIET = {"drift_arcmin2_s": 0, "microsaccades_per_s": 0}

@@ -74,8 +74,8 @@ class Clips:
         return out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Series:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class _Recording:
     """Images of one camera in one recording: moments (n,), rows (eyes, n), and what happens in them."""
 
     moment: Ints
@@ -91,7 +91,7 @@ class _Series:
         return [bool(self.blink[at].any()), bool(self.saccade[at].any()), slips]
 
 
-def _series(folder: ImageFolder, rows: Ints, both_eyes: bool) -> list[_Series]:
+def _series(folder: ImageFolder, rows: Ints, both_eyes: bool) -> list[_Recording]:
     """Collect the images of each camera and recording, in order of time."""
     found: dict[tuple[Any, ...], dict[int, dict[str, tuple[int, dict[str, Any]]]]] = {}
     for row in rows.tolist():
@@ -107,7 +107,7 @@ def _series(folder: ImageFolder, rows: Ints, both_eyes: bool) -> list[_Series]:
     return [one for images in found.values() for one in _recordings(images)]
 
 
-def _recordings(images: Mapping[int, Mapping[str, tuple[int, dict[str, Any]]]]) -> list[_Series]:
+def _recordings(images: Mapping[int, Mapping[str, tuple[int, dict[str, Any]]]]) -> list[_Recording]:
     """Divide the images of a camera where time begins anew."""
     eyes = [eye for eye in EYES if any(eye in seen for seen in images.values())]
     moments = [moment for moment in sorted(images) if all(eye in images[moment] for eye in eyes)]
@@ -116,11 +116,11 @@ def _recordings(images: Mapping[int, Mapping[str, tuple[int, dict[str, Any]]]]) 
     return [_one(images, eyes, part) for part in parts if len(part)]
 
 
-def _one(images: Mapping[int, Mapping[str, Any]], eyes: Sequence[str], moments: Ints) -> _Series:
+def _one(images: Mapping[int, Mapping[str, Any]], eyes: Sequence[str], moments: Ints) -> _Recording:
     seen = [[images[moment][eye] for moment in moments.tolist()] for eye in eyes]
     events = [[set(record["events"]) for _, record in one] for one in seen]
     poses = [record["rig_pose"] or {"rotation_rad": [0.0] * 3, "translation_mm": [0.0] * 3} for _, record in seen[0]]
-    return _Series(
+    return _Recording(
         moment=moments,
         rows=np.array([[row for row, _ in one] for one in seen]),
         blink=np.array([any("blink" in one[k] for one in events) for k in range(len(moments))]),

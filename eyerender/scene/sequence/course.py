@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -12,11 +14,13 @@ from scipy.spatial.transform import Rotation
 from ...base.arrays import Floats, Statuses
 from ...eye.pose import listing_torsion
 from ...population.pupil import watson_yellott_mm
-from .gaze import BEFORE_S, STEP_S, Carrier, GazeCourse, Looking, model_course, table_course
+from .gaze import BEFORE_S, STEP_S, GazeCourse, Looking, model_course, table_course
 from .habits import Habits
 from .spec import (
-    Aim,
+    Aiming,
+    GazeModel,
     GazeTable,
+    HeadModel,
     HeadTable,
     LidModel,
     LidTable,
@@ -28,12 +32,13 @@ from .spec import (
 )
 from .states import States
 
-_OPENING = (
-    2.3  # duration of a blink's opening over that of its closing (chosen; closing is 40 to 47 % faster, Sforza 2008)
-)
+# Duration of a blink's opening over that of its closing: closing is then 43 % faster at its peak (40 to 47 %, Sforza
+# et al. 2008). As the duration of closing does not depend on the size, its peak velocity is proportional to the size.
+_OPENING = 2.42
 _CLOSED_S = 0.0083  # how long a spontaneous blink is closed
 _VOLUNTARY = 1.18, 0.0134  # durations of closing over spontaneous ones, and of the closed phase
-_PARTIAL = (0.5, 0.9)  # closure of partial blinks
+_PARTIAL = (0.5, 0.9)  # closure of partial blinks (chosen)
+_INTERVALS = 0.7  # deviation of the logarithm of the intervals between blinks, which are right-skewed (chosen)
 _DILATES = 3.5  # time constant of dilation over that of constriction
 _FIELD_DEG = 60.0
 _JUMP_STEPS = 50  # of the grid, in which a jump of the rig happens
@@ -59,12 +64,13 @@ class MovingEyes:
         )
 
     @classmethod
-    def of(cls, sequence: Sequence, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
+    def of(cls, sequence: Sequence, aim: Aiming, habits: Habits, resting_mm: Floats) -> MovingEyes:
         """Make a sequence's courses on the grid.
 
         Raises:
             InputError: an eye cannot look at a target.
         """
+        sequence = sequence.resolved()
         count = round((sequence.duration_s + 2 * BEFORE_S) / STEP_S) + 2
         times = np.asarray(STEP_S * np.arange(count) - BEFORE_S, dtype=np.float64)
         seed = (sequence.seed & 0xFFFFFFFF, sequence.seed >> 32)
@@ -72,11 +78,12 @@ class MovingEyes:
         turn, shift = _rig(sequence, times, seed)
         if isinstance(sequence.gaze, GazeTable):
             gaze = table_course(sequence.gaze, times, head, aim)
-            torsion = np.zeros(count) if sequence.gaze.torsion_deg is None else sequence.gaze.at("torsion_deg", times)
+            torsion = sequence.gaze.at("torsion_deg", times)
         else:
+            assert isinstance(sequence.gaze, GazeModel)
             carried = _carried(turn, shift) if sequence.gaze.frame == "rig" else None
             gaze = model_course(sequence.gaze, times, head, Looking(aim, habits, carried), seed)
-            torsion = np.full(count, sequence.gaze.torsion_deg)
+            torsion = sequence.gaze.torsion_at(times)
         blinks = _blinks(sequence, times, habits, seed)
         slow = {"head": head, "rig_turn": turn, "rig_shift": shift, "torsion": np.radians(torsion)}
         slow["pupil"] = _pupils(sequence, times, gaze, habits, resting_mm, seed)
@@ -130,16 +137,17 @@ class MovingEyes:
         """Return closure, squint and wide (n, 2)."""
         table, nothing = self._sequence.lids, np.full((len(times_s), 2), np.nan)
         if isinstance(table, LidTable):
-            given = [None if getattr(table, k) is None else table.at(k, times_s) for k in ("blink", "squint", "wide")]
-            blink, squint, wide = (np.zeros(len(times_s)) if v is None else v for v in given)
-            return tuple(np.repeat(v[:, None], 2, axis=1) for v in (blink, squint, wide))  # type: ignore[return-value]
+            blink, squint, wide = (
+                np.repeat(table.at(key, times_s)[:, None], 2, axis=1) for key in ("blink", "squint", "wide")
+            )
+            return blink, squint, wide
         if not self._blinks.closure.any():
             return nothing, nothing, nothing
         closure = np.interp(inside, self._times, self._blinks.closure)
         return np.repeat(closure[:, None], 2, axis=1), nothing, nothing
 
 
-def _carried(turn_rad: Floats, shift_mm: Floats) -> Carrier | None:
+def _carried(turn_rad: Floats, shift_mm: Floats) -> Callable[[Floats], Floats] | None:
     """Return what moves targets with the rig; None if it is still."""
     if not (turn_rad.any() or shift_mm.any()):
         return None
@@ -163,20 +171,21 @@ def _slow_noise(times_s: Floats, low_hz: float | None, high_hz: float, axes: int
 def _head(sequence: Sequence, times_s: Floats, seed: tuple[int, ...]) -> Floats:
     if isinstance(sequence.head, HeadTable):
         return sequence.head.at("mm", times_s)
-    if not sequence.head.sway_mm:
+    model = sequence.head
+    assert isinstance(model, HeadModel)
+    if not model.sway_mm:
         return np.zeros((len(times_s), 3))
     rng = np.random.default_rng((*seed, 0x5A1A))
-    return sequence.head.sway_mm * _slow_noise(times_s, None, sequence.head.sway_hz, 3, rng)
+    return model.sway_mm * _slow_noise(times_s, None, model.sway_hz, 3, rng)
 
 
 def _rig(sequence: Sequence, times_s: Floats, seed: tuple[int, ...]) -> tuple[Floats, Floats]:
     """Return rotation vectors and translations (n, 3) of the rig."""
-    nothing = np.zeros((len(times_s), 3))
-    table = sequence.rig
-    if isinstance(table, RigTable):
-        turn = nothing if table.rotation_rad is None else table.at("rotation_rad", times_s)
-        return turn, nothing if table.translation_mm is None else table.at("translation_mm", times_s)
-    return _slippage(table, times_s, sequence.duration_s, np.random.default_rng((*seed, 0x511F)))
+    source = sequence.rig
+    if isinstance(source, RigTable):
+        return source.at("rotation_rad", times_s), source.at("translation_mm", times_s)
+    assert isinstance(source, SlippageModel)
+    return _slippage(source, times_s, sequence.duration_s, np.random.default_rng((*seed, 0x511F)))
 
 
 def _slippage(
@@ -196,37 +205,63 @@ def _slippage(
 
 
 def _blinks(sequence: Sequence, times_s: Floats, habits: Habits, seed: tuple[int, ...]) -> _Blinks:
-    """Draw blinks; one that would begin within another is left out."""
-    closure, phase = np.zeros(len(times_s)), np.zeros(len(times_s), dtype=np.int8)
-    if not isinstance(model := sequence.lids, LidModel):
+    """Draw blinks; a spontaneous one that would overlap another is left out."""
+    model = sequence.lids
+    if isinstance(model, LidTable):
         return _table_blinks(model, times_s)
-    rng = np.random.default_rng((*seed, 0xB114))
-    starts = [(at, 1.0, *_VOLUNTARY) for at in model.at_s]
-    rate = model.blinks_per_minute * habits.blinks / 60.0
-    if rate > 0.0:
-        spread = 0.7  # of the logarithm of the intervals, which are right-skewed (chosen)
-        count = 8 + int(4 * rate * (times_s[-1] - times_s[0]))
-        waits = np.exp(rng.normal(np.log(1.0 / rate) - spread**2 / 2, spread, count))
-        first = float(times_s[0]) - rng.random() / rate
-        whole = rng.random(count) < model.complete_share
-        sizes = np.where(whole, 1.0, rng.uniform(*_PARTIAL, count))
-        starts += [
-            (float(at), float(size), 1.0, _CLOSED_S) for at, size in zip(first + np.cumsum(waits), sizes, strict=True)
-        ]
-    busy_until = -np.inf
-    for begin, size, longer, closed_s in sorted(starts):
-        if begin < busy_until:
-            continue
-        closing = habits.closing_s * longer * np.sqrt(size)
-        opening = _OPENING * closing
-        shut, opens, busy_until = begin + closing, begin + closing + closed_s, begin + closing + closed_s + opening
-        inside = (times_s >= begin) & (times_s < busy_until)
-        t = times_s[inside]
-        falls = np.sin(np.pi / 2 * np.clip((t - begin) / closing, 0, 1)) ** 2
-        rises = np.cos(np.pi / 2 * np.clip((t - opens) / opening, 0, 1) ** 0.75) ** 2
-        closure[inside] = size * np.where(t < opens, falls, rises)
-        phase[inside] = np.select([t < shut, t < opens], [1, 2], 3)
+    assert isinstance(model, LidModel)
+    longer, closed_s = _VOLUNTARY
+    stated = [_Blink(at, 1.0, habits.closing_s * longer, closed_s) for at in model.at_s]
+    blinks: list[_Blink] = []
+    for blink in sorted(stated) + _spontaneous(model, times_s, habits, np.random.default_rng((*seed, 0xB114))):
+        if all(blink.begin_s >= other.end_s or blink.end_s <= other.begin_s for other in blinks):
+            blinks.append(blink)
+    closure, phase = np.zeros(len(times_s)), np.zeros(len(times_s), dtype=np.int8)
+    for blink in blinks:
+        inside = slice(*np.searchsorted(times_s, [blink.begin_s, blink.end_s]).tolist())
+        closure[inside], phase[inside] = blink.closure(times_s[inside])
     return _Blinks(closure, phase)
+
+
+class _Blink(NamedTuple):
+    """A blink: its beginning (s), its size (1 shuts the eye), and the durations (s) of closing and of being closed."""
+
+    begin_s: float
+    size: float
+    closing_s: float
+    closed_s: float
+
+    @property
+    def end_s(self) -> float:
+        return self.begin_s + self.closing_s * (1.0 + _OPENING) + self.closed_s
+
+    def closure(self, times_s: Floats) -> tuple[Floats, Statuses]:
+        """Return closure and phase at times within it.
+
+        It closes by 10 x^3 - 15 x^4 + 6 x^5, whose peak velocity is 1.875 / T, and opens as (1 - x)^7 (1 + 7 x).
+        """
+        x = np.clip((times_s - self.begin_s) / self.closing_s, 0.0, 1.0)
+        opens = self.begin_s + self.closing_s + self.closed_s
+        y = np.clip((times_s - opens) / (_OPENING * self.closing_s), 0.0, 1.0)
+        falls, rises = x**3 * (10.0 - 15.0 * x + 6.0 * x**2), (1.0 - y) ** 7 * (1.0 + 7.0 * y)
+        phase = np.select([x < 1.0, times_s < opens], [1, 2], 3).astype(np.int8)
+        return self.size * np.where(times_s < opens, falls, rises), phase
+
+
+def _spontaneous(model: LidModel, times_s: Floats, habits: Habits, rng: np.random.Generator) -> list[_Blink]:
+    """Draw spontaneous blinks with log-normal intervals."""
+    rate = model.rate_hz * habits.blinks
+    if rate == 0.0:
+        return []
+    count = 8 + int(4 * rate * (times_s[-1] - times_s[0]))
+    waits = np.exp(rng.normal(-np.log(rate) - _INTERVALS**2 / 2, _INTERVALS, count))
+    begins = float(times_s[0]) - rng.random() / rate + np.cumsum(waits)
+    whole = rng.random(count) < model.complete_share
+    sizes = np.where(whole, 1.0, rng.uniform(*_PARTIAL, count))
+    return [
+        _Blink(begin, size, habits.closing_s, _CLOSED_S)
+        for begin, size in zip(begins.tolist(), sizes.tolist(), strict=True)
+    ]
 
 
 def _table_blinks(table: LidTable, times_s: Floats) -> _Blinks:
@@ -241,13 +276,15 @@ def _pupils(
     sequence: Sequence, times_s: Floats, gaze: GazeCourse, habits: Habits, resting_mm: Floats, seed: tuple[int, ...]
 ) -> Floats:
     """Return the diameters of the stops (n, 2) mm."""
-    if isinstance(table := sequence.pupil, PupilTable):
-        return np.repeat(table.at("mm", times_s)[:, None], 2, axis=1)
+    model = sequence.pupil
+    if isinstance(model, PupilTable):
+        return np.repeat(model.at("mm", times_s)[:, None], 2, axis=1)
+    assert isinstance(model, PupilModel)
     noise = np.zeros(len(times_s))
-    if table.hippus:
+    if model.hippus:
         rng = np.random.default_rng((*seed, 0x4199))
-        noise = table.hippus * _slow_noise(times_s, 0.05, 1.0, 1, rng)[:, 0]
-    change = _reflex(table, times_s, gaze, habits)
+        noise = model.hippus * _slow_noise(times_s, 0.05, 1.0, 1, rng)[:, 0]
+    change = _reflex(model, times_s, gaze, habits)
     return np.clip(resting_mm[None] * (1.0 + noise[:, None]) * change[:, None], 1.0, 9.0)
 
 

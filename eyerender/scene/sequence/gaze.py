@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from ...base.arrays import Bools, Floats, Ints
 from .habits import Habits
 from .saccades import acceleration_share, duration_s, fallen_gain, oscillation_mm, progress
-from .spec import Aim, GazeModel, GazeTable
+from .spec import Aiming, GazeModel, GazeTable
 
 STEP_S, BEFORE_S = 1e-3, 0.5
 """Step of the grid, and how long before and after a sequence it reaches."""
@@ -25,10 +25,6 @@ _CORRELATED_S = 0.02  # of the velocity of drift
 _MICRO_DEG = (0.1, 0.3, 1.0)  # least, median and largest microsaccade
 _AWAY_S = 0.15  # from the beginning of a fixation to its first microsaccade
 _RINGS_S, _FADED = 0.1, 0.1  # longest oscillation after a saccade that is called so, and its least share of the peak
-
-
-Carrier = Callable[[Floats], Floats]
-"""Moves targets (n, 3) mm on the grid with the rig."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -56,7 +52,7 @@ class _Fixations:
     pursued: Bools
 
 
-def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aim) -> GazeCourse:
+def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aiming) -> GazeCourse:
     """Return the gaze of a user's table on a grid."""
     n = len(times_s)
     target = np.full((n, 3), np.nan)
@@ -84,9 +80,9 @@ def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aim) -
 class Looking:
     """Who looks: what aims an eye, the person's habits, and what moves targets with the rig, if it moves."""
 
-    aim: Aim
+    aim: Aiming
     habits: Habits
-    carried: Carrier | None = None
+    carried: Callable[[Floats], Floats] | None = None
 
 
 def model_course(
@@ -157,7 +153,7 @@ def _without_repeats(size: int, count: int, rng: np.random.Generator) -> Ints:
     return np.asarray(np.cumsum(steps) % size)
 
 
-def _aimed_at(target_mm: Floats, head_mm: Floats, times_s: Floats, aim: Aim, number: Ints | None = None) -> Floats:
+def _aimed_at(target_mm: Floats, head_mm: Floats, times_s: Floats, aim: Aiming, number: Ints | None = None) -> Floats:
     """Return the angles (n, 2 eyes, 2) of eyes that look at targets (n, 3) with the head at (n, 3).
 
     With `number` (n,), targets stand still, and each number is aimed at once; else the eyes are aimed every 50 ms.
@@ -196,7 +192,7 @@ def _with_saccades(
     lasting = np.where(size > 0.01, duration_s(size) * habits.duration, 0.0)
     ends = fixations.begin_s + lasting
     passed = (times_s - fixations.begin_s[number]) / np.maximum(lasting[number], 1e-9)
-    left = 1.0 - progress(passed, acceleration_share(size)[number])
+    left = 1.0 - progress(passed, habits.skew * acceleration_share(size)[number])
     return wanted - left[:, None, None] * jump[number], ends, size
 
 

@@ -14,6 +14,7 @@ class Habits:
 
     Attributes:
         duration: duration of saccades relative to the mean (a coefficient of variation of 12 %).
+        skew: share of a saccade's duration in which it accelerates, relative to the mean.
         fixation: duration of fixations relative to the mean.
         drift: speed of drift relative to the mean.
         oscillation_mm: gain of the oscillation of the pupil after saccades.
@@ -29,6 +30,7 @@ class Habits:
     """
 
     duration: float
+    skew: float
     fixation: float
     drift: float
     oscillation_mm: float
@@ -45,7 +47,9 @@ class Habits:
     def drawn(cls, seed: tuple[int, ...]) -> Self:
         """Draw the habits of a person."""
         rng = np.random.default_rng((*seed, 0x4AB1))
+        skew = float(np.clip(np.random.default_rng((*seed, 0x5E3F)).normal(1.0, 0.05), 0.85, 1.15))
         return cls(
+            skew=skew,
             duration=float(np.clip(rng.normal(1.0, 0.12), 0.7, 1.3)),
             fixation=float(np.exp(rng.normal(0.0, 0.2))),
             drift=float(np.exp(rng.normal(0.0, 0.25))),

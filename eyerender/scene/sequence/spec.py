@@ -3,37 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ...base.arrays import Floats, Ints
+from ...base.arrays import Bools, Floats, Ints
+from ...base.errors import InputError
 from ...base.spec import NonNegative, Number, Positive, Spec, Vec2, Vec3
 from ...rig.screen import ScreenPlane
+from .files import MAX_ROWS, read_columns, read_times
 
-if TYPE_CHECKING:
-    from .course import MovingEyes
-    from .habits import Habits
-
-Share = Annotated[float, Field(ge=0, le=1)]
-Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=20_000)]
+Closure = Annotated[float, Field(ge=0, le=1)]
+Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=MAX_ROWS)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
-Aim = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
+Aiming = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
 """Turns an eye (0 right, 1 left) towards targets (k, 3) mm with the head at (k, 3) mm: azimuth and elevation, rad."""
 
 
-def _by_times(table: str, model: str) -> Callable[[Any], str]:
-    def tag(value: Any) -> str:
-        return (
-            table if (value.get("time_s") if isinstance(value, Mapping) else getattr(value, "time_s", None)) else model
-        )
+def _source(value: Any) -> str:
+    """Return the tag by which pydantic selects among a file, a table and a model."""
+    for key, tag in (("file", "[file]"), ("time_s", "[table]")):
+        if value.get(key) if isinstance(value, Mapping) else getattr(value, key, None):
+            return tag
+    return "[model]"
 
-    return tag
+
+class TraceFile(Spec):
+    """A CSV table with a column for each key; a point has three, `target_x` to `target_z` for `target_mm`.
+
+    Columns are `time_s` and, for gaze, `azimuth_deg`, `elevation_deg`, `torsion_deg` or `target_x`, `target_y`,
+    `target_z`; for lids `blink`, `squint`, `wide`; for the pupil and the head `mm` and `x`, `y`, `z`; for the rig
+    `rotation_x`, ... and `translation_x`, ...
+    """
+
+    file: Annotated[str, Field(min_length=1)] = Field(description="path, relative to the scene")
+    columns: dict[str, str] | None = Field(
+        default=None, description="names of columns that are called otherwise, such as `{azimuth_deg: x}`"
+    )
+    unit_s: Positive = Field(default=1.0, description="length of the file's unit of time: 0.001 for milliseconds")
+
+    def read(self, table: type[_Table], base: Path | None) -> _Table:
+        """Read the file as a table; its path is relative to `base`. Rows with missing values are left out.
+
+        Raises:
+            InputError: the file cannot be read, or its values do not fit.
+        """
+        path = (base or Path()) / self.file
+        parts = {key: _parts(key, vector=key in table.VECTORS) for key in table.model_fields}
+        every = [part for columns in parts.values() for part in columns]
+        if unknown := sorted((self.columns or {}).keys() - set(every)):
+            raise InputError(f"must be one of {', '.join(every)}", path=f"columns.{unknown[0]}")
+        needed = [parts[key] for key, field in table.model_fields.items() if field.is_required()]
+        names = {part: part for part in every} | (self.columns or {})
+        found = read_columns(path, names, tuple(part for columns in needed for part in columns))
+        found["time_s"] = found["time_s"] * self.unit_s
+        data = {}
+        for key, columns in parts.items():
+            if all(part in found for part in columns):
+                values = np.stack([found[part] for part in columns], axis=-1)
+                data[key] = (values if key in table.VECTORS else values[:, 0]).tolist()
+        return table.from_mapping(data, source=str(path))
+
+
+def _parts(key: str, *, vector: bool) -> tuple[str, ...]:
+    """Return the columns of a key: itself, or one per axis."""
+    stem = key.rpartition("_")[0]
+    return tuple(f"{stem}_{axis}".lstrip("_") for axis in "xyz") if vector else (key,)
 
 
 class _Table(Spec):
     """Values of the user's own at times, with straight lines between them; the ends are held."""
+
+    VECTORS: ClassVar[tuple[str, ...]] = ()
+    """Keys whose values are points or vectors."""
 
     time_s: Times = Field(description="times, rising")
 
@@ -48,7 +92,9 @@ class _Table(Spec):
         return self
 
     def at(self, name: str, times_s: Floats) -> Floats:
-        """Interpolate one of its values at times (n,): (n,) or (n, 3)."""
+        """Interpolate one of its values at times (n,): (n,) or (n, 3); values that are not given are 0."""
+        if getattr(self, name) is None:
+            return np.zeros((len(times_s), 3) if name in self.VECTORS else len(times_s))
         values = np.array(getattr(self, name), dtype=float)
         if values.ndim == 1:
             return np.asarray(np.interp(times_s, self.time_s, values))
@@ -57,6 +103,8 @@ class _Table(Spec):
 
 class GazeTable(_Table):
     """The user's own gaze: the optic axes of both eyes, or targets in the world, which both eyes fixate."""
+
+    VECTORS: ClassVar[tuple[str, ...]] = ("target_mm",)
 
     azimuth_deg: tuple[Angle, ...] | None = Field(default=None, description="azimuth of the optic axes")
     elevation_deg: tuple[Angle, ...] | None = Field(default=None, description="elevation of the optic axes")
@@ -70,6 +118,12 @@ class GazeTable(_Table):
         ):
             raise ValueError("give either azimuth_deg and elevation_deg, or target_mm")
         return self
+
+
+class Torsion(_Table):
+    """Torsion in time."""
+
+    value_deg: tuple[Angle, ...] = Field(description="torsion; straight between its times")
 
 
 class GazeModel(Spec):
@@ -105,16 +159,24 @@ class GazeModel(Spec):
     microsaccades_per_s: Annotated[float, Field(ge=0, le=5)] = Field(
         default=1.0, description="rate of microsaccades, 0.1 to 1 degree (1 to 2 per second)"
     )
-    pursuit_share: Share = Field(default=0.0, description="share of the fixations whose target moves")
+    pursuit_share: Closure = Field(default=0.0, description="share of the fixations whose target moves")
     pursuit_deg_s: Annotated[float, Field(ge=0, le=40)] = Field(default=10.0, description="speed of these targets")
     oscillation: bool = Field(default=True, description="whether the pupil oscillates in the eye after saccades")
-    torsion_deg: Angle = Field(default=0.0, description="torsion, added to that of Listing's law")
+    torsion_deg: Annotated[
+        Annotated[Angle, Tag("NumberSpec")] | Annotated[Torsion, Tag("Torsion")],
+        Discriminator(lambda value: "Torsion" if isinstance(value, Mapping | Torsion) else "NumberSpec"),
+    ] = Field(default=0.0, description="torsion, added to that of Listing's law; a number, or a table")
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         if sum(given is not None for given in (self.targets, self.screen_mm, self.grid)) > 1:
             raise ValueError("give only one of targets, screen_mm and grid")
         return self
+
+    def torsion_at(self, times_s: Floats) -> Floats:
+        """Return the added torsion (n,) degrees at times."""
+        torsion = self.torsion_deg
+        return torsion.at("value_deg", times_s) if isinstance(torsion, Torsion) else np.full(len(times_s), torsion)
 
     def placed(self, screen: ScreenPlane | None) -> Self:
         """Return the model with its targets in the world.
@@ -134,23 +196,30 @@ class GazeModel(Spec):
 class LidTable(_Table):
     """The user's own lids."""
 
-    blink: tuple[Share, ...] = Field(description="closure of the lids, 0 to 1")
-    squint: tuple[Share, ...] | None = Field(default=None, description="lower lid raised")
-    wide: tuple[Share, ...] | None = Field(default=None, description="upper lid raised above its rest")
+    blink: tuple[Closure, ...] = Field(description="closure of the lids, 0 to 1")
+    squint: tuple[Closure, ...] | None = Field(default=None, description="lower lid raised")
+    wide: tuple[Closure, ...] | None = Field(default=None, description="upper lid raised above its rest")
 
 
 class LidModel(Spec):
     """Spontaneous blinks, and voluntary ones at stated times."""
 
-    blinks_per_minute: Annotated[float, Field(ge=0, le=120)] = Field(
-        default=15.0,
-        description="mean rate of spontaneous blinks; intervals are log-normal (19.8 +- 4.9 watching a film; 10.3 +- "
-        "3.1 fixating, Doughty 2002, Optom. Vis. Sci. 79)",
+    task: Literal["watching", "fixating"] = Field(
+        default="watching", description="sets the rate: 19.8 per minute watching a film, 10.3 fixating (Doughty 2002)"
     )
-    complete_share: Share = Field(
+    blinks_per_minute: Annotated[float, Field(ge=0, le=120)] | None = Field(
+        default=None, description="mean rate of spontaneous blinks, whose intervals are log-normal; default: the task's"
+    )
+    complete_share: Closure = Field(
         default=0.47, description="share of blinks that shut the eye (52.9 % of 1,414 are partial, Ousler et al. 2014)"
     )
     at_s: tuple[NonNegative, ...] = Field(default=(), description="voluntary, complete blinks begin at these times")
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean rate of spontaneous blinks, per second."""
+        task = {"watching": 19.8, "fixating": 10.3}[self.task]
+        return (task if self.blinks_per_minute is None else self.blinks_per_minute) / 60.0
 
 
 class PupilTable(_Table):
@@ -182,6 +251,8 @@ class PupilModel(Spec):
 class HeadTable(_Table):
     """The user's own displacement of the head."""
 
+    VECTORS: ClassVar[tuple[str, ...]] = ("mm",)
+
     mm: tuple[Vec3, ...] = Field(description="displacement")
 
 
@@ -194,6 +265,8 @@ class HeadModel(Spec):
 
 class RigTable(_Table):
     """The user's own motion of the rig, x' = R x + t about the world's origin."""
+
+    VECTORS: ClassVar[tuple[str, ...]] = ("rotation_rad", "translation_mm")
 
     rotation_rad: tuple[Vec3, ...] | None = Field(default=None, description="rotation vector")
     translation_mm: tuple[Vec3, ...] | None = Field(default=None, description="translation")
@@ -219,14 +292,53 @@ class Timestamps(Spec):
         default=0.0, description="share of the frames that are lost, of a scene (a dataset's clips are whole)"
     )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=0, description="selects jitter and lost frames")
+    time_s: Times | None = Field(
+        default=None,
+        description="the times that a user's own cameras stored, with their gaps, in place of frame rates; the first "
+        "frame begins with the sequence",
+    )
+    file: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="a file of such times, .npy or CSV with a column `time_s`, relative to the scene"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.time_s is None and self.file is None:
+            return self
+        if self.time_s is not None and self.file is not None:
+            raise ValueError("give only one of time_s and file")
+        if self.jitter_ms or self.dropped_share:
+            raise ValueError("times of one's own have neither jitter_ms nor dropped_share")
+        if self.time_s is not None and np.any(np.diff(self.time_s) <= 0):
+            raise ValueError("time_s: must rise")
+        return self
+
+    def resolved(self, base: Path | None = None) -> Self:
+        """Return it with its file read in.
+
+        Raises:
+            InputError: the file cannot be read, or its times do not rise.
+        """
+        if self.file is None:
+            return self
+        path = (base or Path()) / self.file
+        data = {**self.to_mapping(), "file": None, "time_s": read_times(path).tolist()}
+        return self.from_mapping(data, source=str(path))
+
+    def starts_s(self) -> Floats | None:
+        """Return when (n,) the frames of a user's own times begin, after the first one; None without such times."""
+        own = self.resolved().time_s
+        return None if own is None else np.asarray(own, dtype=np.float64) - own[0]
 
     def stored_s(self, start_s: Floats, exposure_s: Floats, number: Ints, camera: Ints) -> Floats:
         """Return the stored times (n,) of frames that start at (n,), the `number`-th ones of their cameras."""
+        if (own := self.resolved().time_s) is not None:
+            return np.array(own, dtype=np.float64)[number]
         part = {"start": 0.0, "middle": 0.5, "end": 1.0}[self.meaning]
         jitter = 1e-3 * self.jitter_ms * self._drawn(number, camera, 0x717E).standard
         return np.asarray(start_s + part * exposure_s + 1e-3 * self.offset_ms + jitter)
 
-    def dropped(self, number: Ints, camera: Ints) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def dropped(self, number: Ints, camera: Ints) -> Bools:
         """Return which frames are lost."""
         return np.asarray(self._drawn(number, camera, 0xD409).uniform < self.dropped_share)
 
@@ -247,30 +359,34 @@ class _Drawn:
         self.standard, self.uniform = standard, uniform
 
 
+_File = Annotated[TraceFile, Tag("[file]")]
 Gaze = Annotated[
-    Annotated[GazeTable, Tag("[table]")] | Annotated[GazeModel, Tag("[model]")],
-    Discriminator(_by_times("[table]", "[model]")),
+    _File | Annotated[GazeTable, Tag("[table]")] | Annotated[GazeModel, Tag("[model]")],
+    Discriminator(_source),
 ]
 Lids = Annotated[
-    Annotated[LidTable, Tag("[table]")] | Annotated[LidModel, Tag("[model]")],
-    Discriminator(_by_times("[table]", "[model]")),
+    _File | Annotated[LidTable, Tag("[table]")] | Annotated[LidModel, Tag("[model]")],
+    Discriminator(_source),
 ]
 Pupil = Annotated[
-    Annotated[PupilTable, Tag("[table]")] | Annotated[PupilModel, Tag("[model]")],
-    Discriminator(_by_times("[table]", "[model]")),
+    _File | Annotated[PupilTable, Tag("[table]")] | Annotated[PupilModel, Tag("[model]")],
+    Discriminator(_source),
 ]
 HeadMotion = Annotated[
-    Annotated[HeadTable, Tag("[table]")] | Annotated[HeadModel, Tag("[model]")],
-    Discriminator(_by_times("[table]", "[model]")),
+    _File | Annotated[HeadTable, Tag("[table]")] | Annotated[HeadModel, Tag("[model]")],
+    Discriminator(_source),
 ]
 RigMotion = Annotated[
-    Annotated[RigTable, Tag("[table]")] | Annotated[SlippageModel, Tag("[model]")],
-    Discriminator(_by_times("[table]", "[model]")),
+    _File | Annotated[RigTable, Tag("[table]")] | Annotated[SlippageModel, Tag("[model]")],
+    Discriminator(_source),
 ]
+_TABLES: dict[str, type[_Table]] = {
+    "gaze": GazeTable, "lids": LidTable, "pupil": PupilTable, "head": HeadTable, "rig": RigTable,
+}  # fmt: skip
 
 
 class Sequence(Spec):
-    """Eyes, lids, pupils, head and rig as functions of time; each by a model, or by a table with `time_s`.
+    """Eyes, lids, pupils, head and rig as functions of time; each by a model, a table with `time_s`, or a file.
 
     >>> er.Sequence(duration_s=2, gaze={"field_deg": [10, 5]}).duration_s
     2.0
@@ -289,17 +405,20 @@ class Sequence(Spec):
         description="the instants whose frames are taken, by their numbers, as in a dataset's samples; default: all",
     )
 
-    def build(self, aim: Aim, habits: Habits, resting_mm: Floats) -> MovingEyes:
-        """Make all that is drawn and solved once.
-
-        Args:
-            aim: turns an eye towards targets.
-            habits: those of the person.
-            resting_mm: (2,) diameters of the stops, right and left.
+    def resolved(self, base: Path | None = None) -> Self:
+        """Return the sequence with its files read in; paths are relative to `base`.
 
         Raises:
-            InputError: an eye cannot look at a target.
+            InputError: a file cannot be read, or its values do not fit.
         """
-        from .course import MovingEyes
-
-        return MovingEyes.of(self, aim, habits, resting_mm)
+        changes: dict[str, Any] = {}
+        try:
+            for key, table in _TABLES.items():
+                if isinstance(source := getattr(self, key), TraceFile):
+                    changes[key] = source.read(table, base)
+            key = "timestamps"
+            if self.timestamps is not None and self.timestamps.file is not None:
+                changes[key] = self.timestamps.resolved(base)
+        except InputError as error:
+            raise error if error.source else error.placed(under=key) from None
+        return self.model_copy(update=changes) if changes else self

@@ -1,0 +1,70 @@
+"""Tables and times of a user's own in files: CSV tables, and lists of times in CSV or NumPy's .npy.
+
+Files are not trusted: size, number of rows and magnitudes are limited, and each problem is one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.errors import InputError
+from ...base.spec import LARGEST
+from ...base.storage.arrays import mapped_array
+from ...base.storage.files import read_table, shown
+
+MAX_ROWS = 20_000
+"""Most rows of a table: 20 s at 1,000 Hz."""
+_MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "."))
+
+
+def read_columns(path: Path, names: Mapping[str, str], needed: tuple[str, ...]) -> dict[str, Floats]:
+    """Read columns of a CSV table; rows in which one of them is missing are left out.
+
+    Args:
+        path: the file.
+        names: what each column is called in the file.
+        needed: the columns that the file must have; of the others, it may have any.
+
+    Raises:
+        InputError: the file cannot be read, lacks a column, has too many rows, or a cell is no number.
+    """
+    rows = list(islice(read_table(path, [names[key] for key in needed]), MAX_ROWS + 1))
+    if len(rows) > MAX_ROWS:
+        raise InputError(f"has more than {MAX_ROWS} rows", source=str(path))
+    given = [key for key, name in names.items() if key in needed or any(name in row for row in rows)]
+    kept = [row for row in rows if all(row.get(names[key], "").strip().lower() not in _MISSING for key in given)]
+    if not kept:
+        raise InputError("has no row in which all columns have values", source=str(path))
+    return {key: np.array([_number(row[names[key]], names[key], path) for row in kept]) for key in given}
+
+
+def read_times(path: Path) -> Floats:
+    """Read times (n,) s: an .npy file such as Pupil's `eye0_timestamps.npy`, or the column `time_s` of a CSV table.
+
+    Raises:
+        InputError: the file cannot be read or holds too many times, or they are not finite.
+    """
+    if path.suffix.lower() != ".npy":
+        return read_columns(path, {"time_s": "time_s"}, ("time_s",))["time_s"]
+    found = mapped_array(path)
+    if found.ndim != 1 or found.dtype.kind not in "iuf" or not 0 < len(found) <= MAX_ROWS:
+        raise InputError(f"must be a list of 1 to {MAX_ROWS} times", source=str(path))
+    times = np.array(found, dtype=np.float64)
+    if not np.all(np.abs(times) <= LARGEST):
+        raise InputError(f"has a time that is not between -{LARGEST:g} and {LARGEST:g}", source=str(path))
+    return times
+
+
+def _number(cell: str, name: str, path: Path) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not abs(value) <= LARGEST:
+        raise InputError(f"{shown(cell)} is not a number up to {LARGEST:g}", source=str(path), path=name)
+    return value
