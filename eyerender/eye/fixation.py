@@ -37,7 +37,7 @@ from ..optics.transforms import inverse_2x2, normalize
 from .batch import CHUNK_POINTS, chunks, groups, take_eyes
 from .landmarks import path_to_retina
 from .model import EyeModel
-from .pose import Poses, Turning, centres_of, into_eye, rigid_motion, split
+from .pose import Poses, Turning, centres_of, into_eye, listing_torsion, rigid_motion, split
 from .pose_kernels import SETTLED_MM, turn_all
 from .worn import Course, choices, more_telling, reachable_by
 
@@ -133,6 +133,46 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
     if line_of_sight == "entrance_window":
         return _by_entrance_window(eye, target)
     raise InputError(f"must be chief_ray or entrance_window, not {line_of_sight!r}", path="line_of_sight")
+
+
+def with_torsion(
+    eyes: Sequence[EyeModel], eye_index: npt.ArrayLike, found: Fixations, target_mm: npt.ArrayLike, extra_rad: Floats
+) -> Poses:
+    """Turn fixating eyes by a torsion in addition to that of Listing's law, so that they still see their targets.
+
+    A turn about the optic axis alone would move the line of sight off the target, by angle kappa times the torsion.
+    The line of sight keeps its direction to the point where it ended; each step turns the eye by the angle it is off.
+
+    Args:
+        eyes: as for `fixations`.
+        eye_index: (n,) as for `fixations`.
+        found: the fixations without it.
+        target_mm: (n, 3) in the eyes' frames.
+        extra_rad: (n,) torsion to add.
+    """
+    which, target = np.asarray(eye_index, dtype=np.intp), np.asarray(target_mm, dtype=np.float64)
+    azimuth, elevation = np.array(found.poses.azimuth_rad), np.array(found.poses.elevation_rad)
+    for k in np.unique(which).tolist():
+        rows = np.flatnonzero(which == k)
+        point, way = found.line_of_sight_mm[rows], found.line_of_sight_direction[rows]
+        start, ahead = _sights(eyes[k], take_rows(found.poses, rows), point, way)
+        end = start + ahead * np.linalg.norm(target[rows] - start, axis=-1, keepdims=True)
+        for _ in range(_STEPS):
+            listing = listing_torsion(azimuth[rows], elevation[rows])
+            poses = Poses(azimuth[rows], elevation[rows], listing + extra_rad[rows])
+            place, direction = _sights(eyes[k], poses, point, way)
+            wanted = end - place
+            off = np.arctan2(wanted[:, 1], wanted[:, 0]) - np.arctan2(direction[:, 1], direction[:, 0])
+            azimuth[rows] += off
+            across = np.hypot(wanted[:, 0], wanted[:, 1]), np.hypot(direction[:, 0], direction[:, 1])
+            elevation[rows] += np.arctan2(wanted[:, 2], across[0]) - np.arctan2(direction[:, 2], across[1])
+    return Poses(azimuth, elevation, listing_torsion(azimuth, elevation) + extra_rad)
+
+
+def _sights(eye: EyeModel, poses: Poses, point_mm: Floats, way: Floats) -> tuple[Floats, Floats]:
+    """Return points and directions (n, 3) of lines of sight that are fixed in posed eyes."""
+    turn, shift = rigid_motion(poses, eye)
+    return np.einsum("nij,nj->ni", turn, point_mm) + shift, np.einsum("nij,nj->ni", turn, way)
 
 
 def far_sight_mm(eye: EyeModel) -> Floats:

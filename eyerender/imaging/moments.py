@@ -22,7 +22,7 @@ _STEP_PX, _MOST_STEPS = 0.5, 64
 """Largest motion between moments of an exposure, and their largest number."""
 _LIMBUS_MM = np.array([[-2.5, y, z] for y, z in ((0.0, 0.0), (6.0, 0.0), (-6.0, 0.0), (0.0, 6.0), (0.0, -6.0))])
 _LID_MM = 10.0  # travel of an upper lid that shuts (Knezi et al. 2020 measured fissures 9.4 mm high)
-_SPEEDS_AT = 9  # times at which the motion during an exposure is looked at
+_SPEEDS_AT = 5  # times at which the motion during an exposure is looked at
 
 
 def moments(

@@ -25,7 +25,7 @@ from ..base.errors import InputError, InputWarning
 from ..base.spec import Side, Spec, file_digest
 from ..base.status import Status
 from ..eye.contact import ContactLens, contact_lens_of
-from ..eye.fixation import fixations
+from ..eye.fixation import fixations, with_torsion
 from ..eye.margin import PupilMargin
 from ..eye.model import EyeModel, Stop
 from ..eye.pose import listing_torsion
@@ -637,12 +637,12 @@ class Scene:
         index = self.index()
         if self.spec.poses is None:
             return Frames(self, index, self._fixating(index))
-        wanted = np.radians([[p.azimuth_deg, p.elevation_deg] for p in self.spec.poses])
-        azimuth, elevation = wanted[index.fixation].T
+        wanted = np.radians([[p.azimuth_deg, p.elevation_deg, p.torsion_deg] for p in self.spec.poses])
+        azimuth, elevation, torsion = wanted[index.fixation].T
         pose = PoseTruth(
             azimuth_rad=azimuth,
             elevation_rad=elevation,
-            torsion_rad=listing_torsion(azimuth, elevation),
+            torsion_rad=listing_torsion(azimuth, elevation) + torsion,
             residual_mm=np.zeros(len(index)),
         )
         return Frames(self, index, pose)
@@ -712,12 +712,15 @@ class Scene:
                 f"the {EYES[index.eye[row]]} eye cannot fixate ({target}) mm: {found.reason(int(bad[0]))}",
                 path=f"targets.{index.fixation[row]}",
             )
-        back = back.reshape(-1)
-        azimuth, elevation = found.poses.azimuth_rad[back], found.poses.elevation_rad[back]
+        back, poses = back.reshape(-1), found.poses
+        if self.spec.targets is not None and self.spec.targets.torsion_deg:
+            seen = index.target_mm[rows] - index.eye_position_mm[rows] - index.head_mm[rows]
+            extra = np.full(len(rows), np.radians(self.spec.targets.torsion_deg))
+            poses = with_torsion(eyes, which[rows], found, seen, extra)
         return PoseTruth(
-            azimuth_rad=azimuth,
-            elevation_rad=elevation,
-            torsion_rad=listing_torsion(azimuth, elevation),
+            azimuth_rad=poses.azimuth_rad[back],
+            elevation_rad=poses.elevation_rad[back],
+            torsion_rad=poses.torsion_rad[back],
             residual_mm=found.residual_mm[back],
         )
 

@@ -185,6 +185,9 @@ class SubjectSpec(Spec):
     )
 
 
+Torsion = Annotated[float, Field(ge=-45, le=45)]
+
+
 class Targets(Spec):
     """Fixation targets: a grid up to the screen's edges, points on the screen, or points in the world.
 
@@ -198,6 +201,9 @@ class Targets(Spec):
     )
     world_mm: Annotated[tuple[Vec3, ...], Field(min_length=1)] | None = Field(
         default=None, description="points in the world"
+    )
+    torsion_deg: Torsion = Field(
+        default=0.0, description="torsion, added to that of Listing's law; the eyes see their targets even so"
     )
 
     @classmethod
@@ -225,6 +231,7 @@ class EyeDirection(Spec):
     elevation_deg: Annotated[float, Field(gt=-90, lt=90)] = Field(
         description="elevation of the optic axis, positive upwards"
     )
+    torsion_deg: Torsion = Field(default=0.0, description="torsion, added to that of Listing's law")
 
     @classmethod
     def listed(cls, angles_deg: ArrayLike) -> list[Self]:

@@ -21,7 +21,7 @@ from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import stack_stops
 from ..eye.build import fitting_stop
-from ..eye.fixation import fixations
+from ..eye.fixation import fixations, with_torsion
 from ..eye.model import EyeModel, Stop
 from ..eye.spec import EyeSpec
 from ..rig.rig import RigGeometry
@@ -129,7 +129,11 @@ def _aim(scene: TimedScene) -> Callable[[Floats, Floats, int], tuple[Floats, Flo
             target = ", ".join(f"{v:.4g}" for v in targets_mm[bad[0]])
             reason = found.reason(int(bad[0]))
             raise InputError(f"the {EYES[eye]} eye cannot fixate ({target}) mm: {reason}", path="gaze")
-        return found.poses.azimuth_rad, found.poses.elevation_rad
+        poses, torsion = found.poses, scene.spec.sequence.gaze.torsion_deg if scene.spec.sequence else 0.0
+        if isinstance(torsion, float) and torsion:
+            extra = np.full(len(targets_mm), np.radians(torsion))
+            poses = with_torsion([scene.eye(side)], which, found, targets_mm - base - head_mm, extra)
+        return poses.azimuth_rad, poses.elevation_rad
 
     return aim
 

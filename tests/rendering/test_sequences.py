@@ -116,3 +116,20 @@ def test_labels_of_a_blink_and_of_the_pupil_are_those_of_the_instant(renderer, t
     np.testing.assert_allclose(sizes, [round(3 + line["time_s"], 3) for line in lines], atol=1e-9)
     assert {line["records"][0]["eye"] for line in lines} <= set(EYES)
     assert er.validate(tmp_path / "out")["problems"] == []
+
+
+def test_torsion_turns_the_iris_by_itself(renderer):
+    """Coordinates on the iris at the same pixels turn by the torsion; a plane iris lies about the axis of torsion."""
+    scene = er.load_scene("headset").with_(
+        {"image.spp": 1, "image.window_px": [160, 120]}, region=None, gaze_deg=[0, 0]
+    )
+    found = []
+    for torsion in (0.0, 5.0):
+        job = render_job(scene.with_({"poses.0.torsion_deg": torsion}).frames(), 0)
+        found.append(renderer.render(replace(job, geometry=("iris_coordinates",))).geometry.iris_coordinates)
+    both = np.isfinite(found).all(axis=(0, 3)) & (np.hypot(*np.moveaxis(found[0], -1, 0)) > 2.5)
+    angles = [np.arctan2(one[both][:, 1], one[both][:, 0]) for one in found]
+    turns = np.degrees(np.angle(np.exp(1j * (angles[1] - angles[0]))))
+    assert np.count_nonzero(both) > 1000
+    centre = np.abs(scene.eye("right").stop.centre_mm[1:]).max()
+    assert abs(abs(np.median(turns)) - 5.0) < 1e-4 + 5 * centre
