@@ -15,7 +15,8 @@ import numpy as np
 
 from ..base.arrays import Floats, Objects
 from ..base.errors import InputError
-from .gazeseries import Display, GazeSeries, Run, gaze_series, has_event, runs
+from ..scene.events import has_event
+from .gazeseries import Display, GazeSeries, Run, gaze_series, runs
 from .trace import Trace
 
 _FIRST_MS = 1000  # time of the first sample, as a tracker's clock runs before a recording

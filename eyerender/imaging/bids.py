@@ -21,8 +21,9 @@ import numpy as np
 
 from ..base.storage.files import write_bytes, write_json, write_text
 from ..base.versions import __version__ as VERSION
+from ..scene.events import has_event
 from ..scene.observation import EYES
-from .gazeseries import GazeSeries, gaze_series, has_event, runs
+from .gazeseries import GazeSeries, gaze_series, runs
 from .trace import Trace
 
 BIDS_VERSION = "1.11.0"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Objects
+from ..base.arrays import Floats, Objects
 from ..base.errors import InputError
 from ..eye.pose import Poses, rigid_motion
 from ..rig.screen import ScreenPlane
@@ -91,12 +91,6 @@ def runs(kind: Objects) -> list[Run]:
     """Divide a series (n,) of names into runs of one name."""
     edges = np.flatnonzero(np.concatenate([[True], kind[1:] != kind[:-1], [True]])).tolist()
     return [Run(str(kind[a]), a, b - 1) for a, b in pairwise(edges)]
-
-
-def has_event(events: Objects, word: str) -> Bools:
-    """Return in which samples (n,) something happens."""
-    names = {text: word in (text or "").split("+") for text in set(events.tolist())}
-    return np.array([names[text] for text in events.tolist()], dtype=bool)
 
 
 def degrees_of(direction: Floats) -> Floats:
