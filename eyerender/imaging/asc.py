@@ -16,7 +16,7 @@ import numpy as np
 from ..base.arrays import Floats, Objects
 from ..base.errors import InputError
 from ..scene.events import has_event
-from .gazeseries import Display, GazeSeries, Run, gaze_series, runs
+from .gazeseries import Display, GazeSeries, Stretch, gaze_series, runs
 from .trace import Trace
 
 _FIRST_MS = 1000  # time of the first sample, as a tracker's clock runs before a recording
@@ -96,8 +96,8 @@ def _header(trace: Trace, eyes: Sequence[_Eye], screen_px: tuple[int, int]) -> I
 class _Events(NamedTuple):
     """The runs of an eye by their first and by their last sample."""
 
-    begins: dict[int, Run]
-    ends: dict[int, Run]
+    begins: dict[int, Stretch]
+    ends: dict[int, Stretch]
 
 
 def _body(eyes: Sequence[_Eye], times_ms: Floats) -> Iterator[str]:
@@ -124,7 +124,7 @@ def _cells(one: _Eye) -> list[str]:
     return [f"{x:7.1f}\t{y:7.1f}\t{area:7.1f}" if found else "   .\t   .\t    0.0" for x, y, area, found in values]
 
 
-def _end(run: Run, one: _Eye, times_ms: Floats) -> str:
+def _end(run: Stretch, one: _Eye, times_ms: Floats) -> str:
     """Write the end of an event: its times, and for fixations and saccades where they were."""
     begin, end = times_ms[run.first], times_ms[run.last]
     step = times_ms[1] - times_ms[0] if len(times_ms) > 1 else 1.0
@@ -145,13 +145,13 @@ def _end(run: Run, one: _Eye, times_ms: Floats) -> str:
     return "\t".join([head, *ends, f"{_amplitude(direction, run):6.2f}", f"{_peak(direction, run, step):6.0f}"])
 
 
-def _amplitude(direction: Floats, run: Run) -> float:
+def _amplitude(direction: Floats, run: Stretch) -> float:
     """Return the angle (degrees) from the beginning of a run to its end."""
     cosine = float(np.clip(direction[run.first] @ direction[run.last], -1.0, 1.0))
     return float(np.degrees(np.arccos(cosine)))
 
 
-def _peak(direction: Floats, run: Run, step_ms: float) -> float:
+def _peak(direction: Floats, run: Stretch, step_ms: float) -> float:
     """Return the largest angular speed (deg/s) in a run."""
     way = np.linalg.norm(np.diff(direction[run.first : run.last + 2], axis=0), axis=1)
     return float(np.degrees(way.max(initial=0.0)) / step_ms * 1e3)

@@ -79,7 +79,7 @@ class GazeSeries:
     display: Display | None
 
 
-class Run(NamedTuple):
+class Stretch(NamedTuple):
     """Samples `first` to `last` of one kind."""
 
     kind: str
@@ -87,21 +87,18 @@ class Run(NamedTuple):
     last: int
 
 
-def runs(kind: Objects) -> list[Run]:
+def runs(kind: Objects) -> list[Stretch]:
     """Divide a series (n,) of names into runs of one name."""
     edges = np.flatnonzero(np.concatenate([[True], kind[1:] != kind[:-1], [True]])).tolist()
-    return [Run(str(kind[a]), a, b - 1) for a, b in pairwise(edges)]
-
-
-def degrees_of(direction: Floats) -> Floats:
-    """Return azimuth and elevation (n, 2) in degrees of unit vectors (n, 3) in the world."""
-    x, y, z = direction.T
-    return np.asarray(np.degrees(np.stack([np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0))], axis=1)))
+    return [Stretch(str(kind[a]), a, b - 1) for a, b in pairwise(edges)]
 
 
 def places_of(origin_mm: Floats, direction: Floats, display: Display | None) -> Floats:
-    """Return gaze (n, 2) of lines of sight: px on a display, or degrees."""
-    return degrees_of(direction) if display is None else display.pixels(origin_mm, direction)
+    """Return gaze (n, 2) of lines of sight: px on a display, or azimuth and elevation in degrees."""
+    if display is not None:
+        return display.pixels(origin_mm, direction)
+    x, y, z = direction.T
+    return np.asarray(np.degrees(np.stack([np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0))], axis=1)))
 
 
 def gaze_series(trace: Trace, screen_px: tuple[int, int] = SCREEN_PX) -> Iterator[tuple[GazeSeries, Floats]]:

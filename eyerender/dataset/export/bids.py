@@ -27,14 +27,12 @@ from ...rig.screen import Screen
 from .item import Items
 from .recordings import Moment, Recordings, moment_of
 
-_Key = tuple[int, int]
-
 
 def write(items: Items, out: Path) -> None:
     """Write the recordings of every person."""
     counter, participants = Recordings(), dict[int, dict[str, Any]]()
     current: dict[tuple[int, str], list[Moment]] = {}
-    key: _Key | None = None
+    key: tuple[int, int] | None = None
 
     def finish() -> None:
         if key is None:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import csv
 import math
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -70,33 +69,22 @@ def _frame(item: Item) -> tuple[Moment, NDArray[Any]]:
     return moment_of(item), item.encoded
 
 
-@dataclass(frozen=True, slots=True)
-class _View:
-    """How a recording is shown: each `step`-th frame, at a rate."""
-
-    step: int
-    rate_hz: float
-
-    @classmethod
-    def of(cls, rate_hz: float, speed: float) -> _View:
-        """Choose a rate that players can show."""
-        step = max(1, math.ceil(rate_hz * speed / _VIEWED_HZ))
-        return cls(step, rate_hz * speed / step)
-
-
 class _Film:
     """Files of one eye in a recording, open until its last frame is added."""
 
     def __init__(self, folder: Path, first: Moment, shape: tuple[int, ...], *, bits: int, speed: float) -> None:
         self._folder, self._first, self._bits = folder, first, bits
         self._moments: list[Moment] = []
-        self._view = _View.of(first.rate_hz, speed)
+        # Players show at most 60 frames per second, so of faster videos only each `step`-th frame is for them.
+        self._step = max(1, math.ceil(first.rate_hz * speed / _VIEWED_HZ))
         self.size = (shape[1], shape[0])
         with ExitStack() as stack:
             lossless = LosslessVideo(
                 folder / f"{first.name}.mkv", *self.size, rate_hz=min(first.rate_hz, _MOST_HZ), bits=bits
             )
-            viewing = ViewingVideo(folder / f"{first.name}_view.mp4", *self.size, rate_hz=self._view.rate_hz)
+            viewing = ViewingVideo(
+                folder / f"{first.name}_view.mp4", *self.size, rate_hz=first.rate_hz * speed / self._step
+            )
             self._lossless, self._viewing = stack.enter_context(lossless), stack.enter_context(viewing)
             self._open = stack.pop_all()
 
@@ -105,7 +93,7 @@ class _Film:
         if picture.shape != self.size[::-1]:
             raise InputError("needs images of one size", source="--format video")
         self._lossless.add(picture)
-        if len(self._moments) % self._view.step == 0:
+        if len(self._moments) % self._step == 0:
             self._viewing.add(picture if self._bits == 8 else np.round(picture / 257).astype(np.uint8))
         self._moments.append(moment)
 
