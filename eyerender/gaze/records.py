@@ -89,7 +89,11 @@ def load_observations(
 
 
 def _placed(observations: Observations, scene: Scene | None) -> Observations:
-    """Place eyes whose place is not recorded where the scene has them."""
+    """Place eyes whose place is not recorded where the scene has them, and targets of a moving rig in its frame."""
+    sequence = None if scene is None else scene.spec.sequence
+    if scene is not None and sequence is not None and getattr(sequence.gaze, "frame", "world") == "rig":
+        mount = scene.spec.rig.mount
+        observations = observations.in_rig(None if mount is None else mount.motion())
     index = observations.index
     if scene is None or not (lost := np.isnan(index.eye_position_mm).any(axis=1) & (index.eye >= 0)).any():
         return observations

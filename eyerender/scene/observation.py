@@ -256,6 +256,30 @@ class Observations(ArrayValue):
         targets = np.broadcast_to(np.asarray(target_mm, dtype=float), (len(self), 3))
         return replace(self, index=replace(self.index, target_mm=frozen(targets)))
 
+    def in_rig(self, mount: tuple[ArrayLike, ArrayLike] | None = None) -> Observations:
+        """Return targets and places of eyes as the rig of a sequence has them, which moves in the world.
+
+        Estimators know the rig where its mount puts it. Gaze on a headset's display, which moves along with the
+        cameras, is therefore judged in its frame.
+
+        Args:
+            mount: R (3, 3) and t (3,) mm of the rig's mount, x' = R x + t, as of `Mount.motion`; default: none.
+        """
+        from scipy.spatial.transform import Rotation
+
+        at = self.index
+        R, offset = (np.eye(3), np.zeros(3)) if mount is None else map(np.asarray, mount)
+        moved = np.isfinite(at.rig_rotation_rad).all(axis=1)
+        turn = Rotation.from_rotvec(np.where(moved[:, None], at.rig_rotation_rad, 0.0))
+
+        def inside(points: Floats) -> Floats:
+            own = turn.inv().apply(points - np.where(moved[:, None], at.rig_translation_mm, 0.0)) @ R.T + offset
+            return np.asarray(np.where(moved[:, None], own, points))
+
+        place = inside(at.eye_position_mm + at.head_mm)
+        changed = replace(at, target_mm=inside(at.target_mm), eye_position_mm=place, head_mm=np.zeros(place.shape))
+        return replace(self, index=changed)
+
     def with_noise(
         self, noise: PixelNoise | float, seed: int | np.random.Generator = 0, *, s2s_over_sd: float = WHITE
     ) -> Observations:

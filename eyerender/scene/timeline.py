@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..base.arrays import Floats, Indices, Ints
+from ..base.arrays import Floats, Indices, Ints, remembered
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.batch import stack_stops
@@ -74,6 +74,7 @@ class TimedScene(Protocol):
         ...
 
 
+@remembered
 def course_of(scene: TimedScene) -> MovingEyes:
     """Return the course of a scene's sequence; scenes that differ in other things share it."""
     spec, rest = scene.spec, scene.spec.to_mapping()

@@ -216,3 +216,20 @@ def test_a_pulse_must_fit_into_a_frame_and_agree_with_the_duty_cycle():
     with pytest.raises(InputError, match=r"the pulses and frame rates make 0\.2"):
         in_time(led={"pulse": {"width_ms": 2.0}, "duty_cycle": 0.5})
     assert in_time(led={"pulse": {"width_ms": 2.0}}).rig.lights[0].duty_cycle == pytest.approx(0.2)
+
+
+def test_gaze_on_targets_of_the_rig_is_judged_in_its_frame():
+    """The rig turns by 2 degrees about an eye that stands still: gaze in the rig changes by as much."""
+    turn = {"time_s": [0.0, 1.0], "rotation_rad": [[0, 0, 0], [0, 0, np.radians(2.0)]]}
+    target = {"time_s": [0.0], "target_mm": [[1000.0, 0.0, 0.0]]}
+    keys = {"duration_s": 1.0, "lids": {"blinks_per_minute": 0}, "pupil": {"hippus": 0}}
+    seen = trace(
+        in_time(sequence={**keys, "gaze": target, "rig": turn}).with_({"rig.mount": {"translation_mm": [1, 0, 0]}})
+    )
+    inside = seen.in_rig((np.eye(3), [1.0, 0.0, 0.0]))
+    gap = inside.index.target_mm - inside.index.eye_position_mm
+    angle = np.degrees(np.arctan2(gap[:, 1], gap[:, 0]))
+    assert np.ptp(angle) == pytest.approx(2.0 * np.ptp(seen.index.time_s), abs=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(gap, axis=1), np.linalg.norm(gap[0]), atol=1e-9)
+    assert not inside.index.head_mm.any()
+    np.testing.assert_array_equal(inside.pupil.centre_px, seen.pupil.centre_px)  # features do not know
