@@ -284,11 +284,11 @@ def _pupils(
     if model.hippus:
         rng = np.random.default_rng((*seed, 0x4199))
         noise = model.hippus * _slow_noise(times_s, 0.05, 1.0, 1, rng)[:, 0]
-    change = _reflex(model, times_s, gaze, habits)
+    change = _reflex(model, times_s, gaze, habits, float(resting_mm.mean()))
     return np.clip(resting_mm[None] * (1.0 + noise[:, None]) * change[:, None], 1.0, 9.0)
 
 
-def _reflex(model: PupilModel, times_s: Floats, gaze: GazeCourse, habits: Habits) -> Floats:
+def _reflex(model: PupilModel, times_s: Floats, gaze: GazeCourse, habits: Habits, resting_mm: float) -> Floats:
     """Return the pupil relative to its rest (n,), which follows light and vergence with a latency."""
     goal = np.ones(len(times_s))
     if model.luminance is not None:
@@ -298,7 +298,7 @@ def _reflex(model: PupilModel, times_s: Floats, gaze: GazeCourse, habits: Habits
         goal = (sizes / sizes[0])[number]
     if model.near_mm_per_d and np.isfinite(gaze.target_mm).all():
         vergence = 1e3 / np.linalg.norm(gaze.target_mm, axis=1)
-        goal = goal - model.near_mm_per_d * (vergence - vergence[0]) / 4.0
+        goal = goal - model.near_mm_per_d * (vergence - vergence[0]) / resting_mm
     if (goal == 1.0).all():
         return goal
     late = np.interp(times_s - habits.latency_s, times_s, goal)
