@@ -41,7 +41,7 @@ def test_a_calibration_leaves_out_what_is_no_fixation(scene, seen):
     assert all(reason is None for reason in reasons[~moving])
     _, told = fit_estimator(er.gaze.Regression("R3", normalised=False), seen, scene.rig)
     assert told["calibration_observations"] == len(seen) - moving.sum()
-    assert told["calibration_error_deg"]["mean"] < 0.5
+    assert told["calibration_error_deg"]["mean_deg"] < 0.5
 
 
 def test_estimates_of_a_sequence_are_judged_by_event(scene, seen):
