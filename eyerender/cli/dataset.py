@@ -243,12 +243,16 @@ def export_dataset(
         "openeds",
         "ellseg",
         "teyed",
+        "video",
+        "bids",
     ],
     bits: Literal[8, 16] = 8,
     encoding: Literal["stored", "linear", "gamma"] | None = None,
     gain: float | None = None,
     workers: AtLeastOne = 1,
     shuffle: int | None = None,
+    speed: float = 1.0,
+    screen_px: tuple[int, int] = (1920, 1080),
     overwrite: Overwrite = False,
     json: Result = None,
 ) -> int:
@@ -257,13 +261,16 @@ def export_dataset(
     Args:
         folder: A folder written by generate.
         format: The layout.
-        bits: Bits per pixel of the images: 8, or 16 for webdataset, imagefolder, coco, csv and parquet.
+        bits: Bits per pixel of the images: 8, or 16 for webdataset, imagefolder, coco, csv, parquet and video.
         encoding: The codes as the camera stored them, linear, or with a gamma of 2.2 (default: as stored if the dataset
             has 8 bits; else gamma for 8 bits, linear for 16 bits).
         gain: Exposure gain of linear or gamma images (default: measured on a sample of the images; 1 for 16-bit linear
             images).
         workers: Number of processes that read and encode images. The bytes do not depend on it.
-        shuffle: Write the images in a random order with this seed, instead of that of the samples (not teyed, labels).
+        shuffle: Write the images in a random order with this seed, instead of that of the samples (not teyed, labels,
+            video, bids).
+        speed: With --format video: how fast the videos to look at run; 0.1 is a tenth of the speed of the recording.
+        screen_px: With --format bids: width and height of the screen in pixels.
     """
     from ..dataset.export import export
 
@@ -277,6 +284,8 @@ def export_dataset(
             gain=gain,
             workers=workers or 1,
             shuffle=shuffle,
+            speed=speed,
+            screen_px=screen_px,
             overwrite=overwrite,
             progress=steps,
         )

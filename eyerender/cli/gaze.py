@@ -193,8 +193,16 @@ def _gaze_table(data: dict[str, Any]) -> str:
                     eye=entry["eye"] or "-", **values
                 )
             )
+    for entry in data["summary"]:
+        parts = (f"{word} {_event_cell(one)}" for word, one in (entry["by_event"] or {}).items())
+        lines += [f"{entry['eye'] or '-'}, median error and loss: {', '.join(parts)}"] if entry["by_event"] else []
     lines += [f"degrees: place of the eye {PLACES[place]}" for place in PLACES if _uses(data, place)]
     return "\n".join(lines)
+
+
+def _event_cell(figures: dict[str, Any]) -> str:
+    error = figures["error_deg"]
+    return f"{'-' if error is None else format(error['median'], '.3g')} deg, {figures['data_loss']:.1%}"
 
 
 def _cell(value: float | None, form: str) -> str:

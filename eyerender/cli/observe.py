@@ -35,7 +35,7 @@ def features(
     purkinje: Annotated[tuple[int, ...] | None, Parameter(consume_multiple=True)] = None,
     tracker: Annotated[Tracker, Parameter(name="*")] = Tracker(),
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
-    format: Literal["csv", "asc"] = "csv",
+    format: Literal["csv", "asc", "bids"] = "csv",
     screen_px: tuple[int, int] = (1920, 1080),
     strict: Strict = False,
     json: Result = None,
@@ -47,9 +47,9 @@ def features(
     Args:
         points: Number of boundary points of the pupil.
         purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
-        output: With --rate: the file of the trace.
-        format: With --rate: a table (csv), or EyeLink's text form (asc).
-        screen_px: With --format asc: width and height of the screen in pixels.
+        output: With --rate: the file of the trace, or the folder of bids.
+        format: With --rate: a table (csv), EyeLink's text form (asc), or a folder of BIDS eye tracking (bids).
+        screen_px: With --format asc or bids: width and height of the screen in pixels.
     """
     # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver, purkinje_records
@@ -88,14 +88,22 @@ def features(
 def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px: tuple[int, int]) -> dict[str, Any]:
     """Write the trace of a sequence, and beside a table its schema, which is returned."""
     from ..base.storage.files import csv_text, refuse_special, write_json, write_text
+    from ..folders.outfolder import refuse_non_empty, staged
     from ..imaging.asc import asc_text
+    from ..imaging.bids import write_trace
+    from ..imaging.gazeseries import check_screen
     from ..imaging.trace import sample_sequence
 
-    refuse_special(output)
-    if min(screen_px) < 1 or max(screen_px) > 65536:
-        raise InputError("must be 1 to 65536", source="--screen-px")
+    if form == "bids":
+        refuse_non_empty(output, False)
+    else:
+        refuse_special(output)
+    check_screen(screen_px)
     trace = sample_sequence(scene, tracker)
-    if form == "asc":
+    if form == "bids":
+        with staged(output) as folder:
+            write_trace(folder, trace, screen_px)
+    elif form == "asc":
         write_text(output, asc_text(trace, screen_px))
     else:
         write_text(output, csv_text(trace.header(), trace.rows()))

@@ -22,7 +22,8 @@ from ..base.status import Status
 from ..base.storage.files import csv_text
 from ..rig.rig import RigGeometry
 from ..rig.screen import ScreenPlane
-from ..scene.observation import EYES, Observations
+from ..scene.events import MOVING, has_event
+from ..scene.observation import EVENTS, EYES, Index, Observations
 from .cornea import centres_of
 from .estimate import GazeEstimator, RayEstimator, angular_error_deg, binocular_average, ray_errors_deg
 from .parameters import MEAN_EYE
@@ -94,8 +95,8 @@ def predictions(
             }
             for i in range(len(both))
         ]
-        precision = _precision(both.point_mm, frames.index.target_mm, middle)
-        summary.append({"eye": "both", **_summary(both.ok, errors, source), "quality": precision})
+        figures = {**_summary(both.ok, errors, source), "quality": _precision(both.point_mm, frames.index, middle)}
+        summary.append({"eye": "both", **figures, "by_event": _by_event(frames.index, both.ok, errors["deg"])})
     return {"schema": POINTS_SCHEMA, "gaze": single, "binocular": binocular, "summary": summary}
 
 
@@ -261,16 +262,35 @@ def _by_eye(
     for eye in np.unique(observations.index.eye):
         rows = observations.index.eye == eye
         part = {unit: values[rows] for unit, values in errors.items()}
-        precision = _precision(gaze[0][rows], observations.index.target_mm[rows], gaze[1][rows])
+        index = observations.index.take(rows)
+        precision = _precision(gaze[0][rows], index, gaze[1][rows])
         name = EYES[int(eye)] if eye >= 0 else None
-        out.append({"eye": name, **_summary(ok[rows], part, source[rows]), "quality": precision})
+        figures = {**_summary(ok[rows], part, source[rows]), "quality": precision}
+        out.append({"eye": name, **figures, "by_event": _by_event(index, ok[rows], part["deg"])})
     return out
 
 
-def _precision(point_mm: Floats, target_mm: Floats, from_mm: Floats) -> dict[str, Any] | None:
-    """Compute the medians of `quality` over runs of at least two samples of one target; None if there are none."""
+def _by_event(index: Index, ok: Bools, error_deg: Floats) -> dict[str, Any] | None:
+    """Summarise the samples of a sequence by what the eye does: number, loss and errors; None without events."""
+    rows = {word: has_event(index.events, word) for word in EVENTS}
+    out = {}
+    for word, own in rows.items():
+        if own.any():
+            known = error_deg[own & np.isfinite(error_deg)]
+            loss = float(1 - ok[own].mean())
+            error = _figures(known) if len(known) else None
+            out[word] = {"samples": int(own.sum()), "data_loss": loss, "error_deg": error}
+    return out or None
+
+
+def _precision(point_mm: Floats, index: Index, from_mm: Floats) -> dict[str, Any] | None:
+    """Compute the medians of `quality` over runs of at least two samples of one target; None if there are none.
+
+    Samples of a sequence in which the eye moves or blinks belong to no run.
+    """
+    target_mm, still = index.target_mm, ~has_event(index.events, *MOVING)
     new = np.any(target_mm[1:] != target_mm[:-1], axis=1)
-    runs = np.split(np.arange(len(target_mm)), np.flatnonzero(new) + 1)
+    runs = [run[still[run]] for run in np.split(np.arange(len(target_mm)), np.flatnonzero(new) + 1)]
     known = [run for run in runs if len(run) > 1 and np.isfinite(target_mm[run[0]]).all()]
     if not known:
         return None

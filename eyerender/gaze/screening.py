@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Ints, Objects
+from ..scene.events import MOVING, has_event
 from ..scene.observation import Observations
 from .rays import is_none
 
@@ -30,12 +31,14 @@ _QUADRATIC, _LINEAR = 16, 7
 def wrong_rows(observations: Observations) -> Objects:
     """Return why rows of a calibration are wrong (n,); None where they are not.
 
+    In saccades, in the oscillation after them and in blinks, the gaze is not on its target, or does not show.
     Rows of one eye, camera and head position are judged together, if they show at least seven targets.
     """
     index, pupil, glints = observations.index, observations.pupil, observations.glints
     reason = np.full(len(observations), None, dtype=object)
     for unsure in np.flatnonzero(pupil.confidence < LEAST_CONFIDENCE):
         reason[unsure] = f"the extractor's confidence is {pupil.confidence[unsure]:.2f}"
+    reason[has_event(index.events, *MOVING)] = "the eye is in a saccade, an oscillation after it, or a blink"
     way = index.target_mm - np.nan_to_num(index.eye_position_mm + index.head_mm)
     angles = np.stack([np.arctan2(way[:, 1], way[:, 0]), np.arctan2(way[:, 2], np.hypot(way[:, 0], way[:, 1]))], axis=1)
     features = {"pupil": pupil.centre_px}

@@ -28,6 +28,7 @@ from ..scene.spec import MAX_OBSERVATIONS
 from .tracker import Tracker
 
 TRACE_SCHEMA = "eyerender/trace/1"
+TRUTH = ("azimuth_deg", "elevation_deg", "pupil_mm", "lid_opening_mm", "event", "blink_phase")
 _EVERY_S, _LID_STEP = 0.004, 0.015  # times between openings of open eyes that are computed, and steps of moving lids
 _COLUMNS = 176  # of the lids' edges
 _POINTS = 12  # of an outline: an ellipse has five numbers, and the image of a round stop is one to a thousandth of a px
@@ -53,16 +54,20 @@ class Trace:
         """Return the names of the columns."""
         camera = ["camera"] if len(self.scene.rig.cameras) > 1 else []
         glints = [f"glint{k}_{axis}" for k in range(len(self.scene.rig.lights)) for axis in "xy"]
-        truth = ["azimuth_deg", "elevation_deg", "pupil_mm", "lid_opening_mm", "event", "blink_phase"]
-        return ["time_s", *camera, "eye", *truth, "pupil_x", "pupil_y", *glints]
+        return ["time_s", *camera, "eye", *TRUTH, "pupil_x", "pupil_y", *glints]
+
+    def stop_mm(self) -> Floats:
+        """Return the diameters (n,) mm of the stops."""
+        index = self.observations.index
+        own = {eye: self.scene.stop_diameter_mm(EYES[eye]) for eye in np.unique(index.eye).tolist()}
+        return np.where(np.isfinite(index.stop_mm), index.stop_mm, [own[eye] for eye in index.eye.tolist()])
 
     def rows(self) -> Iterator[list[Any]]:
         """Yield the values of each row; None where there is none."""
         index, pose, pupil, glints = (getattr(self.observations, n) for n in ("index", "pose", "pupil", "glints"))
         several = len(self.scene.rig.cameras) > 1
         angles = np.degrees(np.stack([pose.azimuth_rad, pose.elevation_rad], axis=1)).round(6)
-        own = {eye: self.scene.stop_diameter_mm(EYES[eye]) for eye in np.unique(index.eye).tolist()}
-        stop = np.where(np.isfinite(index.stop_mm), index.stop_mm, [own[eye] for eye in index.eye.tolist()])
+        stop = self.stop_mm()
         lids = self.lid_opening_mm.round(4)
         spots = np.concatenate([pupil.centre_px[:, None], glints.xy_px], axis=1).reshape(len(index), -1).round(4)
         for k in range(len(index)):

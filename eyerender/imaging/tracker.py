@@ -18,7 +18,7 @@ class Tracker:
     Attributes:
         rate: Sample the sequence so many times a second, instead of at the cameras' frames.
         noise_px: With --rate: standard deviation of the features along each axis, px.
-        noise_deg: With --rate and --format asc: standard deviation of the gaze along each axis, degrees.
+        noise_deg: With --rate and --format asc or bids: standard deviation of the gaze along each axis, degrees.
         noise_type: With --rate: the noise's RMS-S2S over its SD; 1.414 is white noise, filtered noise has less.
         loss: With --rate: share of the samples that are lost.
         seed: With --rate: selects noise and losses.

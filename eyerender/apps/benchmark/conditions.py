@@ -29,7 +29,14 @@ CONDITIONS = {
     "interlaced": "odd rows show the image moved by more than 1 px",
     "clipped skin": "more than 2 % of the skin's pixels are at full scale",
     "strong JPEG": "compressed with a quality below 50",
-    "none of these": "none of the other conditions holds",
+    "fixation": "a frame of a sequence in which the eye fixates and the pupil does not oscillate",
+    "saccade": "a frame in a saccade",
+    "oscillation": "a frame in which the pupil oscillates after a saccade",
+    "pursuit": "a frame in which the eye follows a target",
+    "blink, closing": "a frame in a blink whose lids close",
+    "blink, closed": "a frame in a blink whose lids are shut",
+    "blink, opening": "a frame in a blink whose lids open",
+    "none of these": "none of the other conditions holds, but fixation",
 }
 _EDGE_PX, _MOVES_PX, _CLIPPED, _QUALITY = 3.0, 1.0, 0.02, 50
 _ROTATION_MM = 10.5  # distance from an eye's centre of rotation to its pupil
@@ -109,6 +116,15 @@ def _mirrored(panel: Mapping[str, Any], centre_mm: Floats, apex_mm: Floats, lens
     return np.asarray(centre_mm + float(np.linalg.norm(apex_mm - centre_mm)) * normal)
 
 
+def of_events(record: Mapping[str, Any]) -> set[str]:
+    """Return the conditions that say what the eye of a sequence does in a frame."""
+    events, phase = set(record.get("events") or ()), record.get("blink_phase")
+    out = events & {"saccade", "oscillation", "pursuit"}
+    if phase is not None:
+        out.add(f"blink, {phase}")
+    return out or events & {"fixation"}
+
+
 def of_pixels(image: NDArray[Any], bit_depth: int, mask: Bytes | None) -> set[str]:
     """Return conditions that follow from the pixels (h, w), as far as their classes are known."""
     if mask is None or image.dtype.kind == "f":
@@ -119,7 +135,8 @@ def of_pixels(image: NDArray[Any], bit_depth: int, mask: Bytes | None) -> set[st
 
 def tags(*found: set[str]) -> tuple[str, ...]:
     """Return all conditions of an image, in the order of `CONDITIONS`."""
-    every = set().union(*found) or {"none of these"}
+    every = set().union(*found)
+    every |= {"none of these"} if every <= {"fixation"} else set()
     return tuple(name for name in CONDITIONS if name in every)
 
 

@@ -23,7 +23,7 @@ from ...rig.rig import RigGeometry
 from ...scene import Scene
 from ...scene.observation import Observations
 from ...scene.spec import SceneSpec
-from .conditions import of_scene
+from .conditions import of_events, of_scene
 from .glintlabels import TrueGlint
 from .hints import NO_HINTS
 from .labelled import BenchImage, factors_of
@@ -109,7 +109,7 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> BenchImage:
         iris=_iris(labels, corner),
         lids_px=tuple(np.asarray(lids[lid], dtype=np.float64).reshape(-1, 2) - corner for lid in sorted(lids)),
         mask_path=entry.mask_path,
-        conditions=tuple(of_scene(entry.line, ellipse, corner)),
+        conditions=tuple(of_scene(entry.line, ellipse, corner) | of_events(entry.records[0])),
         hidden_glints_px=tuple(hidden),
     )
 

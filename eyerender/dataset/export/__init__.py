@@ -20,8 +20,9 @@ from ...base.storage.files import write_json, write_text
 from ...folders.exported import EXPORT
 from ...folders.imagefolder import ImageFolder
 from ...folders.outfolder import staged
+from ...imaging.gazeseries import SCREEN_PX, check_screen
 from ..assemble import verify_dataset
-from . import coco, ellseg, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo
+from . import bids, coco, ellseg, film, imagefolder, labels, openeds, parquet, table, teyed, webdataset, yolo
 from .card import export_card
 from .encoding import SAMPLED, STORED, Curve, Encoding, check, measured_gain
 from .item import Item, Items, wrong_labels
@@ -43,11 +44,16 @@ FORMATS: dict[str, Writer] = {
     "openeds": openeds.write,
     "ellseg": ellseg.write,
     "teyed": teyed.write,
+    "video": film.write,
+    "bids": bids.write,
 }
 # The other layouts have 8 bits by definition.
-_SIXTEEN_BITS = ("webdataset", "imagefolder", "coco", "csv", "parquet")
-_ORDERED = {"teyed": "the frames of teyed have an order", "labels": "the rows of labels have the order of the shards"}
-_PICTURELESS = ("labels",)
+_SIXTEEN_BITS = ("webdataset", "imagefolder", "coco", "csv", "parquet", "video")
+_ORDERED = {
+    **{format: f"the frames of {format} have an order" for format in ("teyed", "video", "bids")},
+    "labels": "the rows of labels have the order of the shards",
+}
+_PICTURELESS = ("labels", "bids")
 
 
 def export(
@@ -60,6 +66,8 @@ def export(
     gain: float | None = None,
     workers: int = 1,
     shuffle: int | None = None,
+    speed: float = 1.0,
+    screen_px: tuple[int, int] = SCREEN_PX,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -73,14 +81,16 @@ def export(
         path: the folder, written by `render`, `quickstart` or `generate`.
         format: one of `FORMATS`.
         out: the folder to write.
-        bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv and parquet).
+        bits: bits of the images, 8 or 16 (webdataset, imagefolder, coco, csv, parquet and video).
         encoding: `stored` (the codes of the camera), `linear` or `gamma`; by default stored for images of 8 bits
             without a `gain`, else gamma for 8 bits and linear for 16.
         gain: factor for all values of `linear` and `gamma`; by default 1 for 16 bits linear, otherwise measured on a
             sample of the images.
         workers: number of processes that read and encode the images; the bytes do not depend on it.
         shuffle: seed of a random order of the images; by default they are in the order of the samples. It is refused
-            for `teyed` and `labels`, which have an order of their own.
+            for `teyed`, `video`, `bids` and `labels`, which have an order of their own.
+        speed: how fast the videos to look at of `video` run, 0.001 to 100; 1 is the speed of the recording.
+        screen_px: width and height of the picture on the scene's screen, on which `bids` states the gaze.
         overwrite: replace the contents of `out`.
         progress: called with images done, images in all and "images".
 
@@ -92,6 +102,9 @@ def export(
     _check_options(format, bits, encoding, gain, shuffle)
     if workers < 1:
         raise InputError(f"must be >= 1, not {workers}", source="--workers")
+    if not 1e-3 <= speed <= 100:
+        raise InputError(f"must be 0.001 to 100, not {speed:g}", source="--speed")
+    check_screen(screen_px)
     folder = ImageFolder.load(path)
     if format == "labels":
         labels.check_packed(folder)
@@ -104,6 +117,7 @@ def export(
 
     step(0)
     items = Items(folder, step, workers=workers, shuffle=shuffle)
+    items.speed, items.screen_px = speed, screen_px
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
         if format not in _PICTURELESS:

@@ -18,6 +18,7 @@ from ...base.processes import ordered
 from ...base.storage.files import parse_json
 from ...folders.imagefile import image_of, png_bytes
 from ...folders.imagefolder import METADATA, Entries, ImageEntry, ImageFolder, opened_entries
+from ...imaging.gazeseries import SCREEN_PX
 from ...optics.ellipse import Ellipse, signed_distance
 from ...rig.camera import PinholeCamera
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
@@ -203,6 +204,8 @@ class Items:
         workers: number of processes that read and encode images.
         shuffle: seed of the order of the images; None: sample order.
         encoding: encoding of the export.
+        speed: how fast videos to look at run; 1 is the speed of the recording.
+        screen_px: width and height of the picture on a scene's screen.
         order: (n,) row in metadata.jsonl of each image, in the order of the export.
         images_by_split: number of images of each split, by name.
         bit_depths: bit depths of the images.
@@ -219,6 +222,7 @@ class Items:
     ) -> None:
         self.folder, self.step, self.workers, self.shuffle = folder, step, workers, shuffle
         self.encoding = STORED
+        self.speed, self.screen_px = 1.0, SCREEN_PX
         self.order: Ints = np.arange(len(folder.entries))
         self.images_by_split: dict[str, int] = {}
         self.bit_depths: set[int] = set()
