@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Bench of eyes in time: what is drawn against publications and an event detector, and what frames cost.
+"""Bench of eyes in time: what an event detector finds in drawn gaze, and what frames of a sequence cost.
 
     bench_sequences.py [--quick] [--json F] [--remodnav PYTHON]
 
@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from _bench import Report, Row, options_of, row, single_threaded
@@ -28,10 +27,9 @@ from eyerender.imaging.asc import asc_text
 from eyerender.scene.observation import correlated
 from eyerender.scene.sequence.course import MovingEyes
 from eyerender.scene.sequence.habits import Habits
-from eyerender.scene.sequence.saccades import acceleration_share, duration_s, progress
 from eyerender.scene.sequence.spec import Sequence
 
-PEOPLE, LASTING_S = 24, 30.0
+LASTING_S = 30.0
 DETECT = """
 import json, sys
 import numpy as np, remodnav
@@ -59,18 +57,6 @@ def eyes_of(person: int, oscillation: bool) -> MovingEyes:
     gaze = {"oscillation": oscillation, "microsaccades_per_s": 0}
     keys = {"seed": person, "duration_s": LASTING_S, "lids": {"blinks_per_minute": 0}, "pupil": {"hippus": 0}}
     return MovingEyes.of(Sequence.from_mapping({**keys, "gaze": gaze}), aimed, Habits.drawn((person,)), np.full(2, 4.0))
-
-
-def publications() -> Iterator[Row]:
-    """Yield the peak velocities of 24 people: Collewijn, Erkelens and Steinman (1988) have 502 +- 32 deg/s at 40."""
-    t = np.arange(0.0, 0.4, 2e-4)
-    for size, published, spread in ((10.0, 330.0, 30.0), (40.0, 502.0, 32.0)):
-        lasting, share = duration_s(np.array(size)), float(acceleration_share(np.array(size)))
-        people = [Habits.drawn((k,)) for k in range(PEOPLE)]
-        peaks = [np.gradient(size * progress(t / (lasting * p.duration), share), t).max() for p in people]
-        half = 1.96 * np.std(peaks, ddof=1) / np.sqrt(PEOPLE)
-        yield row(f"peak velocity at {size:g} deg", float(np.mean(peaks)), "deg/s")
-        yield row("  off the published mean", abs(np.mean(peaks) - published), "deg/s", must=spread + half)
 
 
 def detected(
@@ -177,7 +163,6 @@ def main() -> int:
     parser.add_argument("--remodnav", metavar="PYTHON", help="a Python that has REMoDNaV")
     options = parser.parse_args()
     report = Report()
-    report.extend(publications())
     report.extend(costs(options.quick))
     if options.remodnav:
         report.extend(detector(options.remodnav, options.quick))
