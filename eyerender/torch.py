@@ -259,7 +259,7 @@ class ClipDataset(Dataset[Any]):
             for own, item in zip(rows, items, strict=True)
         ]
         found = items[0] if len(items) == 1 else _joined(items)
-        kept = {name: items[0][name] for name in ("sample", "subject") if name in items[0]}
+        kept: dict[str, Any] = {name: items[0][name] for name in ("sample", "subject") if name in items[0]}
         return {**found, **kept, "image": torch.cat([image for own in images for image in own])}
 
 

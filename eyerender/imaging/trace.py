@@ -147,19 +147,19 @@ def _without(seen: Observations, missing: Bools, covered: Bools) -> Observations
     )
 
 
-class Lids(NamedTuple):
+class LidOpenings(NamedTuple):
     """Opening of the lids (n,) mm, NaN for a bare eye, and whether they cover the middle of the pupil (n,)."""
 
     opening_mm: Floats
     covered: Bools
 
 
-def _lids(frames: Frames, rate: float) -> Lids:
+def _lids(frames: Frames, rate: float) -> LidOpenings:
     """Compute the lids of rows: of open eyes every few ms, of moving lids wherever they have moved notably."""
     n, scene, index = len(frames), frames.scene, frames.index
     opening, spare = np.full(n, np.nan), np.full(n, np.inf)
     if scene.region is None or scene.region.head is not None:
-        return Lids(opening, spare < 0.0)
+        return LidOpenings(opening, spare < 0.0)
     own = np.nan_to_num(index.lids)
     moved = (own != own.min(axis=0)).any(axis=1)
     every = max(1, round(_EVERY_S * rate))
@@ -177,7 +177,7 @@ def _lids(frames: Frames, rate: float) -> Lids:
         values = _openings(frames, places, margins)
         order = np.argsort(places)
         opening[rows], spare[rows] = (np.interp(rows, places[order], column[order]) for column in values)
-    return Lids(opening, spare < 0.0)
+    return LidOpenings(opening, spare < 0.0)
 
 
 def _steps(lids: Floats) -> list[int]:
@@ -226,7 +226,7 @@ def _angle(edge: Floats, centre: Floats, y_mm: Floats) -> Floats:
     a, b = along[rows, last - 1], along[rows, last]
     share = np.clip((y_mm - a[:, 1]) / (b[:, 1] - a[:, 1]), 0.0, 1.0)
     point = a + share[:, None] * (b - a) - centre
-    return np.arctan2(point[:, 2], point[:, 0])
+    return np.asarray(np.arctan2(point[:, 2], point[:, 0]))
 
 
 def _or_none(value: float) -> float | None:

@@ -269,7 +269,7 @@ class Observations(ArrayValue):
 
         at = self.index
         R, offset = (np.eye(3), np.zeros(3)) if mount is None else map(np.asarray, mount)
-        moved = np.isfinite(at.rig_rotation_rad).all(axis=1)
+        moved: Bools = np.asarray(np.isfinite(at.rig_rotation_rad).all(axis=1))
         turn = Rotation.from_rotvec(np.where(moved[:, None], at.rig_rotation_rad, 0.0))
 
         def inside(points: Floats) -> Floats:

@@ -209,6 +209,8 @@ class Scene:
             device, spec = spec.rig.calibration, spec.model_copy(update={"rig": authored})
             if device is not None:
                 spec = SceneSpec.from_mapping(spec.to_mapping(), source=source)  # whose checks need all cameras
+        if spec.sequence is not None and (read := spec.sequence.resolved(base)) is not spec.sequence:
+            spec = spec.model_copy(update={"sequence": read})
         built = spec.rig.located(base).build(spec.subject.ipd_mm) if rig is None else rig
         if spec.sensor.exposure_ms is None:
             spec = spec.model_copy(update={"sensor": _exposed(spec, built)})

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...base.arrays import Floats
 from ...eye.model import EyeModel
-from ...imaging.capture import eye_motion
+from ...imaging.moments import eye_motion
 from ...optics.triangles import sharp_edges
 from ...region.limbus import lower
 from ...report.style import ANALYTIC, IMAGE, TARGET

@@ -27,8 +27,9 @@ from ...backends.choose import BackendChoice
 from ...base.arrays import Bytes, Floats, Reals, frozen
 from ...base.errors import EyerenderError, one_line
 from ...folders.imagefile import preview
-from ...imaging.capture import EyeImage, check_windows, make_renderer, moments, render_job, stored
+from ...imaging.capture import EyeImage, check_windows, make_renderer, render_job, stored
 from ...imaging.imageobserver import detect
+from ...imaging.moments import moments
 from ...rig.camera import Window
 from ...rig.defocus import vignette
 from ...rig.exposure import radiance_to_irradiance, recorded
@@ -267,7 +268,7 @@ class Painter:
         began = time.perf_counter()
         coarse = self._pace.coarse(width * height)
         shrunk = coarser(job, coarse)
-        done = renderer.render(shrunk, spp=PREVIEW_SPP, moments=moments(frame, 0, shrunk))
+        done = renderer.render(shrunk, spp=PREVIEW_SPP, moments=moments(frame, 0, shrunk, render_job))
         seconds = time.perf_counter() - began
         self._pace.took(seconds)
         canvas.hidden = done.glint_reasons
@@ -292,7 +293,7 @@ class Painter:
                 return
             band = replace(job, window=(x0, y0 + top, width, min(rows, height - top)))
             start = time.perf_counter()
-            done = renderer.render(band, spp=spp, moments=moments(frame, 0, band))
+            done = renderer.render(band, spp=spp, moments=moments(frame, 0, band, render_job))
             self._sample_s = (time.perf_counter() - start) / (spp * done.irradiance.size)
             taken[top : top + rows] = done.irradiance
         seconds = time.perf_counter() - began
