@@ -3,8 +3,8 @@ What the pupil's oscillation does to a tracker
 ==============================================
 
 When a saccade stops, the iris swings on for some 50 ms, and the pupil with it. The cornea does not. A tracker that
-estimates gaze from the vector between pupil and corneal reflection therefore reports an overshoot that the eye never made
-(Hooge et al. 2015; Bouzat et al. 2018). Here the pupil's motion can be switched off, which no eye allows. See
+estimates gaze from the vector between pupil and corneal reflection therefore reports an overshoot that the eye never
+made (Hooge et al. 2015; Bouzat et al. 2018). Here the pupil's motion can be switched off, which no eye allows. See
 :doc:`/sequences`.
 """
 

@@ -9,7 +9,7 @@ import eyerender as er
 from eyerender.apps.live.drawing import colours_of, extent_mm, strokes
 from eyerender.apps.live.readout import feature_table
 from eyerender.apps.live.setup import Setup
-from eyerender.imaging.capture import eye_motion
+from eyerender.imaging.moments import eye_motion
 from eyerender.report.style import ANALYTIC, IMAGE
 
 
