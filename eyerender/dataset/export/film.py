@@ -11,7 +11,8 @@
 Names have the numbers of the person and of the recording; where several cameras see an eye, its files are
 `eye0_camera0.mkv` and so on. Times are seconds from the beginning of the recording; a frame that the camera dropped is
 missing from the video and the tables. A video states the camera's rate, at most 1,000 per second, because Matroska's
-times are whole milliseconds. If a frame's width or height is odd, its last column or row is repeated.
+times are whole milliseconds. If a frame's width or height is odd, its last column or row is repeated. Matroska files
+have random identifiers, so their bytes differ from run to run; their frames do not.
 """
 
 from __future__ import annotations
