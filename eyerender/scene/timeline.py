@@ -130,7 +130,8 @@ def _aim(scene: TimedScene) -> Callable[[Floats, Floats, int], tuple[Floats, Flo
             target = ", ".join(f"{v:.4g}" for v in targets_mm[bad[0]])
             reason = found.reason(int(bad[0]))
             raise InputError(f"the {EYES[eye]} eye cannot fixate ({target}) mm: {reason}", path="gaze")
-        poses, torsion = found.poses, scene.spec.sequence.gaze.torsion_deg if scene.spec.sequence else 0.0
+        poses, gaze = found.poses, scene.spec.sequence.gaze if scene.spec.sequence else None
+        torsion = gaze.torsion_deg if isinstance(gaze, GazeModel) else 0.0
         if isinstance(torsion, float) and torsion:
             extra = np.full(len(targets_mm), np.radians(torsion))
             poses = with_torsion([scene.eye(side)], which, found, targets_mm - base - head_mm, extra)
