@@ -356,7 +356,7 @@ def test_videos_are_lossless(tmp_path, width, height):
 
 
 def test_a_video_that_cannot_be_written_is_an_error(tmp_path):
-    with pytest.raises(OSError, match=r"OpenCV cannot write an FFV1 video of 62 x 46 pixels to v\.mp4"):
+    with pytest.raises(OSError, match=r"OpenCV cannot write a video \(FFV1\) of 62 x 46 pixels to v\.mp4"):
         LosslessVideo(tmp_path / "missing" / "v.mp4", 62, 46)
 
 

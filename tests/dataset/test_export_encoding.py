@@ -17,7 +17,7 @@ from PIL import Image
 
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.dataset.export import FORMATS, Encoding, export
+from eyerender.dataset.export import FORMATS, OF_SEQUENCES, Encoding, export
 from eyerender.dataset.export.encoding import measured_gain
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageFolder
@@ -136,7 +136,7 @@ def test_sixteen_bits_are_the_files_of_the_dataset(tiny, tmp_path):
     for format in ("openeds", "ellseg", "teyed"):
         with pytest.raises(
             InputError,
-            match=f"--bits: the layout {format} holds 8 bits; webdataset, imagefolder, coco, csv, parquet can",
+            match=f"--bits: the layout {format} holds 8 bits; webdataset, imagefolder, coco, csv, parquet, video can",
         ):
             export(tiny, format, tmp_path / "none", bits=16)
 
@@ -161,7 +161,7 @@ def test_an_export_says_how_its_images_are_encoded(tiny, tmp_path, capsys):
         for folder in ("first", "again")
     ]
     assert trees[0] == trees[1]
-    for format in (f for f in FORMATS if f != "labels"):  # which has no images
+    for format in (f for f in FORMATS if f not in ("labels", *OF_SEQUENCES)):  # which has no images
         done = export(tiny, format, tmp_path / format, gain=1.5)
         card = (tmp_path / format / "README.md").read_text()
         for words in (
@@ -257,7 +257,7 @@ READERS = {"webdataset": in_tars, "parquet": in_tables, "ellseg": in_archives, "
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("format", [f for f in FORMATS if f != "labels"])
+@pytest.mark.parametrize("format", [f for f in FORMATS if f not in ("labels", *OF_SEQUENCES)])
 def test_eight_bit_pictures_keep_the_codes_of_their_camera(cameras, tmp_path, format):
     """Whatever the camera's gamma and compression, every layout has the stored codes, and its card says so."""
     done = export(cameras, format, tmp_path / "out")

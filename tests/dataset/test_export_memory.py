@@ -11,11 +11,13 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.dataset.done import sum_of
-from eyerender.dataset.export import FORMATS, export
+from eyerender.dataset.export import FORMATS, OF_SEQUENCES, export
 from tests.support.fabricated import SHARD, fabricate, peak_bytes
 
 pytestmark = [pytest.mark.render, pytest.mark.packaging]
-LAYOUTS = [format for format in FORMATS if format != "labels"]  # that one is of datasets with packed shards only
+LAYOUTS = [
+    format for format in FORMATS if format not in ("labels", *OF_SEQUENCES)
+]  # that one is of datasets with packed shards only
 BAR_BYTES, ROWS = 300 * 2**20, 200_000  # what so many images may take above the base process
 
 # Python's own count, so that some hundred images show what many would take. The first export loads modules.

@@ -10,7 +10,7 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
-from eyerender.dataset.export import FORMATS, export
+from eyerender.dataset.export import FORMATS, OF_SEQUENCES, export
 from eyerender.folders.imagefolder import ImageFolder
 from tests.support.dataset_specs import tree
 
@@ -29,7 +29,11 @@ KINDS = ("yolo-seg", "coco", "webdataset")
 @pytest.mark.packaging
 @pytest.mark.parametrize(
     "format",
-    [pytest.param(name, marks=() if name in KINDS else pytest.mark.slow) for name in FORMATS if name != "labels"],
+    [
+        pytest.param(name, marks=() if name in KINDS else pytest.mark.slow)
+        for name in FORMATS
+        if name not in ("labels", *OF_SEQUENCES)
+    ],
 )
 def test_the_number_of_processes_changes_no_byte(tiny, tmp_path, format):
     shuffle = None if format == "teyed" else 3

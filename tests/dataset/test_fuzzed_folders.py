@@ -19,7 +19,7 @@ from eyerender.apps.inspection import inspect
 from eyerender.apps.quickstart import compare_folder
 from eyerender.dataset.assemble import assemble
 from eyerender.dataset.done import sum_of
-from eyerender.dataset.export import FORMATS, export
+from eyerender.dataset.export import FORMATS, OF_SEQUENCES, export
 from eyerender.dataset.lines import restore_lines
 from eyerender.dataset.runfile import begin
 from eyerender.dataset.shard import withdraw_damaged
@@ -43,7 +43,7 @@ ACTIONS = (
     "compare",
     "records",
     "inspect",
-    *(f for f in FORMATS if f != "labels"),
+    *(f for f in FORMATS if f not in ("labels", *OF_SEQUENCES)),
 )
 HARMS = ("json", "json", "line", "line", "line", "bytes", "link", "link up", "pipe", "folder", "gone")
 

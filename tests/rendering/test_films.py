@@ -129,7 +129,19 @@ def test_a_new_recording_begins_where_time_begins_anew(entries):
     assert counter.number(replace(moment, camera=1, time_s=0.3)) == 1
 
 
-def test_exports_of_sequences_refuse_what_they_cannot_write(folder, tmp_path):
+def test_a_viewing_video_has_the_brightness_of_the_codes(folder, entries, tmp_path):
+    export(folder, "video", tmp_path / "out", encoding="stored", bits=16, speed=0.001)
+    found = frames_of(tmp_path / "out" / "headset_000000_001/eye0_camera0_view.mp4")
+    assert len(found) == len(entries[0])
+    for picture, entry in zip(found, entries[0], strict=True):
+        assert picture[:, :97].mean() == pytest.approx(entry.image().mean() / 4095 * 255, abs=4)
+
+
+def test_exports_of_sequences_refuse_what_they_cannot_write(folder, entries, tmp_path):
+    line = json.loads(json.dumps(entries[0][0].line))
+    line["records"][0]["events"] = None
+    with pytest.raises(InputError, match="shows no frame of a sequence"):
+        moment_of(Item(replace(entries[0][0], line=line)))
     for options, words in (({"shuffle": 1}, "have an order"), ({"speed": 0.0}, "must be 0.001 to 100")):
         with pytest.raises(InputError, match=words):
             export(folder, "video", tmp_path / "out", **options)

@@ -54,6 +54,7 @@ _ORDERED = {
     "labels": "the rows of labels have the order of the shards",
 }
 _PICTURELESS = ("labels", "bids")
+OF_SEQUENCES = ("video", "bids")  # layouts that need frames of a sequence
 
 
 def export(

@@ -11,7 +11,8 @@
 Names have the numbers of the person and of the recording; where several cameras see an eye, its files are
 `eye0_camera0.mkv` and so on. Times are seconds from the beginning of the recording; a frame that the camera dropped is
 missing from the video and the tables. A video states the camera's rate, at most 1,000 per second, because Matroska's
-times are whole milliseconds. If a frame's width or height is odd, its last column or row is repeated.
+times are whole milliseconds. If a frame's width or height is odd, its last column or row is repeated. Matroska files
+have random identifiers, so their bytes differ from run to run; their frames do not.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def write(items: Items, out: Path) -> None:
             table.writerows(film.row() for film in films.values())
             films.clear()
 
-        for moment, picture in items.map(_frame):
+        for moment, picture, bits in items.map(_frame):
             folder = f"{items.name}_{moment.subject:06d}_{counter.number(moment):03d}"
             if folder != current:  # the frames of a recording are consecutive, so only its videos are open
                 finish()
@@ -59,42 +60,41 @@ def write(items: Items, out: Path) -> None:
                     raise ValueError(f"the frames of {folder} are not consecutive")
                 (out / folder).mkdir()
             if moment.name not in films:
-                film = _Film(out / folder, moment, picture.shape, bits=items.encoding.bits, speed=items.speed)
-                films[moment.name] = stack.enter_context(film)
-            films[moment.name].add(moment, picture)
+                films[moment.name] = stack.enter_context(_Film(out / folder, moment, picture, items.speed))
+            films[moment.name].add(moment, picture, bits)
         finish()
 
 
-def _frame(item: Item) -> tuple[Moment, NDArray[Any]]:
-    return moment_of(item), item.encoded
+def _frame(item: Item) -> tuple[Moment, NDArray[Any], int]:
+    """Return a frame, its codes, and the bits of these."""
+    return moment_of(item), item.encoded, item.encoding.of_image(item.bit_depth, item.entry.gamma)["bit_depth"]
 
 
 class _Film:
     """Files of one eye in a recording, open until its last frame is added."""
 
-    def __init__(self, folder: Path, first: Moment, shape: tuple[int, ...], *, bits: int, speed: float) -> None:
-        self._folder, self._first, self._bits = folder, first, bits
+    def __init__(self, folder: Path, first: Moment, picture: NDArray[Any], speed: float) -> None:
+        self._folder, self._first = folder, first
         self._moments: list[Moment] = []
         # Players show at most 60 frames per second, so of faster videos only each `step`-th frame is for them.
         self._step = max(1, math.ceil(first.rate_hz * speed / _VIEWED_HZ))
-        self.size = (shape[1], shape[0])
+        self.size = (picture.shape[1], picture.shape[0])
         with ExitStack() as stack:
-            lossless = LosslessVideo(
-                folder / f"{first.name}.mkv", *self.size, rate_hz=min(first.rate_hz, _MOST_HZ), bits=bits
-            )
+            rate_hz, bits = min(first.rate_hz, _MOST_HZ), 8 * picture.itemsize
+            lossless = LosslessVideo(folder / f"{first.name}.mkv", *self.size, rate_hz=rate_hz, bits=bits)
             viewing = ViewingVideo(
                 folder / f"{first.name}_view.mp4", *self.size, rate_hz=first.rate_hz * speed / self._step
             )
             self._lossless, self._viewing = stack.enter_context(lossless), stack.enter_context(viewing)
             self._open = stack.pop_all()
 
-    def add(self, moment: Moment, picture: NDArray[Any]) -> None:
-        """Add a frame."""
+    def add(self, moment: Moment, picture: NDArray[Any], bits: int) -> None:
+        """Add a frame, whose codes have some bits."""
         if picture.shape != self.size[::-1]:
             raise InputError("needs images of one size", source="--format video")
         self._lossless.add(picture)
         if len(self._moments) % self._step == 0:
-            self._viewing.add(picture if self._bits == 8 else np.round(picture / 257).astype(np.uint8))
+            self._viewing.add(np.round(picture * (255 / (2**bits - 1))).astype(np.uint8))
         self._moments.append(moment)
 
     def row(self) -> list[Any]:

@@ -41,7 +41,7 @@ class LosslessVideo:
         kind = [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, cv2.VIDEOWRITER_PROP_DEPTH, depth]
         self._writer = cv2.VideoWriter(self._path, cv2.CAP_FFMPEG, codec, rate_hz, even, kind)
         if not self._writer.isOpened():
-            raise OSError(f"OpenCV cannot write a video of {width} x {height} pixels to {path.name}")
+            raise OSError(f"OpenCV cannot write a video ({self.CODEC}) of {width} x {height} pixels to {path.name}")
 
     def add(self, image: NDArray[Any]) -> None:
         """Add a frame."""
