@@ -61,6 +61,7 @@ def features(
         raise InputError(f"must be <= {MAX_BOUNDARY_POINTS}", source="--points")
     if purkinje == ():
         raise InputError("needs numbers of Purkinje images, 1 to 4", source="--purkinje")
+    tracker.refuse_unused(format)
     if (output is None) != (tracker.rate == 0.0):
         missing = ("--output", "with --rate") if output is None else ("--rate", "with --output")
         raise InputError(f"is needed {missing[1]}", source=missing[0])

@@ -196,7 +196,7 @@ class Plan:
     def variable_template(self) -> Template:
         """Template of the variables."""
         tree = {"variables": self.spec.variables or {}}
-        return Template.of(tree, self.spec.seed, source=self.source, clips=self.spec.clip_frames > 1)
+        return Template.of(tree, self.spec.seed, source=self.source, clips=self.spec.has_clips)
 
     @cached_property
     def _variables(self) -> dict[str, Unit]:
@@ -219,7 +219,7 @@ class Plan:
             source=self.source,
             prefix="scene",
             variables=self._variables,
-            clips=self.spec.clip_frames > 1,
+            clips=self.spec.has_clips,
         )
 
     @cached_property

@@ -171,13 +171,7 @@ class DatasetSpec(FileSpec):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        n = self.clip_frames
-        for name in ("count", "planned", "shard_size"):
-            if (getattr(self, name) or 0) % n:
-                raise ValueError(f"{name}: must be a multiple of {n}, the frames of a clip")
-        if self.subjects is not None and self.subjects > self.planned_count // n:
-            most = self.planned_count // n
-            raise ValueError(f"subjects: must be at most {most} (count or planned), not {self.subjects}")
+        self._check_clips()
         if self.population is not None and self.eye_parameters:
             raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
         for name in self.variables or {}:
@@ -190,6 +184,18 @@ class DatasetSpec(FileSpec):
                 raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")
         self._check_splits()
         return self
+
+    def _check_clips(self) -> None:
+        stamps = (self.scene.get("sequence") or {}).get("timestamps") if "sequence" in self.scene else None
+        if isinstance(stamps, Mapping) and stamps.get("dropped_share"):
+            raise ValueError("scene.sequence.timestamps.dropped_share: clips of a dataset are whole")
+        n = self.clip_frames
+        for name in ("count", "planned", "shard_size"):
+            if (getattr(self, name) or 0) % n:
+                raise ValueError(f"{name}: must be a multiple of {n}, the frames of a clip")
+        if self.subjects is not None and self.subjects > self.planned_count // n:
+            most = self.planned_count // n
+            raise ValueError(f"subjects: must be at most {most} (count or planned), not {self.subjects}")
 
     def _check_splits(self) -> None:
         if not self.splits:
@@ -229,6 +235,11 @@ class DatasetSpec(FileSpec):
     def subject_count(self) -> int:
         """Number of subjects of the whole plan."""
         return self.subjects or self.planned_count // self.clip_frames
+
+    @property
+    def has_clips(self) -> bool:
+        """Whether samples are frames of clips."""
+        return isinstance(self.scene.get("sequence"), Mapping)
 
     @property
     def clip_frames(self) -> int:
@@ -280,9 +291,9 @@ def _clip_frames(duration_s: Any, rig: Any) -> int:
     """
     cameras = rig.get("cameras") if isinstance(rig, Mapping) else None
     given = [c.get("frame_rate_hz") for c in cameras if isinstance(c, Mapping)] if isinstance(cameras, list) else []
-    rates = {DEFAULT_RATE_HZ if rate is None else rate for rate in given or [None]}
     if any(isinstance(rate, Mapping) for rate in given) or not isinstance(duration_s, int | float):
         raise ValueError("scene.sequence.duration_s: it, and frame_rate_hz of the cameras, must be plain numbers")
+    rates = {DEFAULT_RATE_HZ if rate is None else rate for rate in given or [None]}
     if len(rates) > 1:
         raise ValueError("scene.rig.cameras: must have one frame_rate_hz in a dataset of sequences")
     (rate,) = rates

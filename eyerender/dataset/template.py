@@ -118,6 +118,9 @@ class Template:
         _collect(tree, "", draws, problems, prefix)
         _check_references(tree, "", variables, problems, prefix)
         problems.check()
+        for path in draws if not clips else ():
+            if draws[path].draw.per == "clip":
+                raise InputError("needs a sequence in the scene", source=source, path=f"{_join(prefix, path)}.per")
         if clips:
             draws = {path: _of_clip(placed) for path, placed in draws.items()}
         # Draws are sorted by name, so that the order of keys in a file has no effect.

@@ -380,7 +380,7 @@ def _check(chain: Sequence[tuple[str, list[Observations]]]) -> None:
         raise InputError("needs observations for every step")
     first = chain[0][1][0].index
     if not np.isfinite(first.target_mm).all():
-        raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
+        raise InputError("there are no targets to compare the gaze with; use a scene with targets")
     for name, found in chain:
         for one in found:
             same = len(one) == len(first) and all(

@@ -63,7 +63,7 @@ def leave_one_target_out(estimator: GazeEstimator, observations: Observations, r
     """
     rig, targets = rig.build(), observations.index.target_mm
     if not np.isfinite(targets).all():
-        raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
+        raise InputError("there are no targets to compare the gaze with; use a scene with targets")
     if len(np.unique(observations.index.fixation)) < 2:
         raise InputError(
             "there is only one fixation, but a calibration needs several targets in one scene, "

@@ -71,7 +71,7 @@ def budget_steps(
     if seeds < 1:
         raise InputError(f"must be >= 1, not {seeds}", path="seeds")
     if not np.isfinite(frames.index.target_mm).all():
-        raise InputError("there are no targets to compare the gaze with; use a scene with 'targets' instead of 'poses'")
+        raise InputError("there are no targets to compare the gaze with; use a scene with targets")
     exact = trace(frames)
     simple = _with_eye(frames, reference)
     steps = {ESTIMATOR: [with_stop_centre(trace(simple))], "eye model": [with_stop_centre(exact)], "optics": [exact]}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.interpolate import CubicSpline
 
 from ..base.arrays import Bools, Bytes, Floats, finite_or_none, remembered
 from ..base.errors import InputError
@@ -40,12 +41,13 @@ RIM_HIDDEN = "the cornea hides a part of its rim"
 _OUTLINE_POINTS = 60
 _SAG_STEP_MM = 0.05
 _REACH_MM = 20.0  # from the globe's centre: the lids from corner to corner are about 30 mm wide
+_ROW_TIMES, _ROW_STEPS = 9, 12  # times of a moving limbus between which it is interpolated, and steps to its own rows
 _FAR_MM = 1e9  # a distant observer: the entrance pupil looks larger than from infinity by 3e-9 of its size
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeInWindow:
-    """An eye in a window, without the image: row `row` of frames, its `camera`, `window`, `rig` and `region`.
+    """An eye in a window, without the image: row `row` of frames (alone `frame`), `camera`, `window`, `rig`, `region`.
 
     The window is (x0, y0, width, height) in full-sensor pixels. The eye's frame is placed in the world by x_world = M x
     + t; the apex of the unrotated eye is at apex_mm.
@@ -60,6 +62,7 @@ class EyeInWindow:
     apex_mm: Floats
     rig: RigGeometry
     region: Region | None
+    frame: RenderableFrames
 
     @classmethod
     def of(cls, frames: RenderableFrames, row: int) -> EyeInWindow:
@@ -77,6 +80,7 @@ class EyeInWindow:
             apex_mm=rest_mm(frames, row),
             rig=scene.rig_at(index, row),
             region=scene.region_at(index, row),
+            frame=frames.take([row]),
         )
 
 
@@ -285,10 +289,32 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width, made
     lower by the look's `limbus_aspect`.
 
+    Under a rolling shutter each point is that of its own row's time.
+
     Returns:
         The projected curve, with the points that the cornea hides, and the reason why it is not visible as a whole
         (None if it is).
     """
+    pixels, reason = _limbus_now(scene, view, count)
+    index = view.frame.index
+    timing = scene.timings[view.camera]
+    if not timing.is_rolling or not np.isfinite(index.start_s[0]):
+        return pixels, reason
+    start = float(index.start_s[0])
+    times = np.linspace(start, start + timing.rows * timing.row_s + timing.exposure_s, _ROW_TIMES)
+    moving = view.frame.at([0] * _ROW_TIMES, times)
+    views = [EyeInWindow.of(moving, k) for k in range(_ROW_TIMES)]
+    way = CubicSpline(times, [_limbus_now(scene, one, count)[0] for one in views])
+    lights, each = np.array(scene.rig.lights_of(int(index.eye[0])), dtype=np.int64), np.arange(count)
+    for _ in range(_ROW_STEPS):
+        own = timing.seen([start], pixels[None, :, 1], lights).time_s[0]
+        own = np.where(np.isfinite(own), own, timing.ambient_s(start, pixels[:, 1]))
+        pixels = way(own)[each, each]
+    return pixels, reason
+
+
+def _limbus_now(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
+    """Compute `limbus_px` at the time of a view."""
     surface, camera = view.eye.front[0], view.rig.cameras[view.camera]
     rho = float(view.eye.limbus_radius_mm) - 0.5 * scene.spec.look.limbus_width_mm
     angle = 2 * np.pi * np.arange(count) / count

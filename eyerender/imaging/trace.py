@@ -122,6 +122,7 @@ def sample_sequence(scene: Scene, tracker: Tracker) -> Trace:
     found = _lids(frames, tracker.rate)
     if tracker.noise_px:
         seen = seen.with_noise(tracker.noise_px, tracker.seed, s2s_over_sd=tracker.noise_type)
+    seen = _on_sensor(seen)
     lost = np.random.default_rng((tracker.seed, 0x105E)).random(len(seen)) < tracker.loss
     return Trace(
         tracker=tracker,
@@ -129,6 +130,19 @@ def sample_sequence(scene: Scene, tracker: Tracker) -> Trace:
         observations=_without(seen, lost | found.covered, found.covered),
         lid_opening_mm=found.opening_mm,
     )
+
+
+def _on_sensor(seen: Observations) -> Observations:
+    """Remove features that lie off the sensor."""
+    glints, off = seen.glints, seen.glints.ok & ~seen.glints.in_image
+    status = np.where(off, Status.NOT_FOUND, glints.status).astype(np.int8)
+    seen = replace(seen, glints=replace(glints, status=status, xy_px=np.where(off[..., None], np.nan, glints.xy_px)))
+    outside = seen.pupil.ok & ~seen.pupil.in_image
+    pupil, reason = seen.pupil, seen.pupil.reason.copy()
+    reason[outside] = "off the sensor"
+    status = np.where(outside, Status.NOT_FOUND, pupil.status).astype(np.int8)
+    centre = np.where(outside[:, None], np.nan, pupil.centre_px)
+    return replace(seen, pupil=replace(pupil, status=status, reason=reason, centre_px=centre))
 
 
 def _without(seen: Observations, missing: Bools, covered: Bools) -> Observations:

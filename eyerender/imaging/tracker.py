@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from ..base.errors import InputError
 from ..scene.observation import WHITE
@@ -30,6 +30,21 @@ class Tracker:
     noise_type: float = WHITE
     loss: float = 0.0
     seed: int = 0
+
+    def refuse_unused(self, form: str) -> None:
+        """Raise an error for an option that a trace of this form (csv, asc, bids) does not use.
+
+        Raises:
+            InputError: naming the option.
+        """
+        plain = Tracker()
+        given = [f.name for f in fields(self) if f.name != "rate" and getattr(self, f.name) != getattr(plain, f.name)]
+        if not self.rate and given:
+            raise InputError("needs --rate", source=f"--{given[0].replace('_', '-')}")
+        if form == "csv" and "noise_deg" in given:
+            raise InputError("is noise of the gaze, which --format asc and bids hold", source="--noise-deg")
+        if form == "asc" and "noise_px" in given:
+            raise InputError("is noise of features, which --format csv holds; give --noise-deg", source="--noise-px")
 
     def __post_init__(self) -> None:
         limits = {"rate": (0, 1e5), "noise_px": (0, 1e3), "noise_deg": (0, 45), "noise_type": (1e-3, 1.999)}

@@ -30,7 +30,9 @@ def scene_view(scene: Scene) -> Any:
         flat.remove()
         ax = fig.add_subplot(projection="3d")
         seen = trace(scene)
-        rows = np.flatnonzero((seen.index.head == 0) & (seen.index.fixation == seen.index.fixation[0]))
+        index = seen.index
+        at = index.instant if scene.spec.sequence is not None else index.fixation
+        rows = np.flatnonzero((index.head == 0) & (at == at[0]))
         _screen(ax, scene)
         for k in range(len(scene.rig.cameras)):
             _camera(ax, scene, k)
@@ -54,7 +56,9 @@ def _notes(scene: Scene, seen: Observations) -> list[str]:
     index, pose = seen.index, seen.pose
     fixations = int(scene.index().fixation.max()) + 1
     heads = len(scene.spec.subject.head_positions_mm)
-    if np.isfinite(index.target_mm[0]).all():
+    if scene.spec.sequence is not None:
+        what = f"the sequence after {index.time_s[0]:.3g} s"
+    elif np.isfinite(index.target_mm[0]).all():
         what = f"target 1 of {fixations} at ({', '.join(f'{v:g}' for v in index.target_mm[0])}) mm"
     else:
         azimuth, elevation = np.degrees([pose.azimuth_rad[0], pose.elevation_rad[0]])

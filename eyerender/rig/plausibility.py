@@ -20,6 +20,7 @@ from .light import Lamp
 from .rig import RigGeometry
 from .screen import ScreenPlane
 from .sensor import Sensor
+from .timing import FrameTimes
 
 # Human pupils are about 2 to 8 mm wide (Watson and Yellott 2012, J. Vision 12(10):12); drugs extend the range slightly.
 PUPIL_MM = (1.0, 9.0)
@@ -92,6 +93,18 @@ def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
             # A lamp of size 0 is a point.
             if any(0 < size < least for size in sizes):
                 found.append(InputWarning(code="metres", reason=f"is {_shown(sizes, ' x ')} mm; {_METRES}", path=path))
+    return found
+
+
+def timing_warnings(timings: Sequence[FrameTimes]) -> list[InputWarning]:
+    """Warn of frames that begin before the last one is exposed and read, which no sensor takes."""
+    found = []
+    for k, times in enumerate(timings):
+        taken = times.exposure_s + (times.rows - 1) * times.row_s
+        if taken > times.period_s * (1 + 1e-9):
+            every_ms = 1e3 * times.period_s
+            reason = f"a frame is exposed and read for {1e3 * taken:.4g} ms, but one begins every {every_ms:.4g} ms"
+            found.append(InputWarning(code="frame-rate", reason=reason, path=f"rig.cameras.{k}.frame_rate_hz"))
     return found
 
 

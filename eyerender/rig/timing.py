@@ -37,8 +37,8 @@ class Rolling(Spec):
 
 
 Shutter = Annotated[
-    Annotated[Literal["global"], Tag("TextSpec")] | Annotated[Rolling, Tag("Rolling")],
-    Discriminator(lambda value: "TextSpec" if isinstance(value, str) else "Rolling"),
+    Annotated[Literal["global"], Tag("TextSpec")] | Annotated[Rolling, Tag("[rolling]")],
+    Discriminator(lambda value: "TextSpec" if isinstance(value, str) else "[rolling]"),
 ]
 
 

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -47,6 +47,7 @@ from ..rig.plausibility import (
     mirror_warnings,
     place_warnings,
     pupil_warnings,
+    timing_warnings,
     view_warnings,
     wavelength_warnings,
 )
@@ -427,6 +428,7 @@ class Scene:
             *pupil_warnings(self.pupil_diameter_mm, pupil),
             *wavelength_warnings(spec.wavelength_nm),
             *length_warnings(spec.to_mapping()),
+            *(timing_warnings(self.timings) if spec.sequence is not None else ()),
             *place_warnings(rig, eyes, heads, cameras, lights),
             *mirror_warnings(spec.rig.cameras, eyes),
             *self._face_warnings([*zip(cameras, rig.cameras, strict=True)], [*zip(lights, rig.lights, strict=True)]),
@@ -595,6 +597,8 @@ class Scene:
 
         A camera has no row of an eye that it does not see.
         """
+        if self.spec.sequence is not None:
+            return rows_in_time(self)[0]
         spec = self.spec
         targets = self.targets_mm
         fixations = len(targets) if targets is not None else len(spec.poses or ())
@@ -635,7 +639,7 @@ class Scene:
             InputError: no pose of an eye fixates a target; the message names the target and the reason.
         """
         if self.spec.sequence is not None:
-            return Frames(self, *rows_in_time(self))
+            return self._placed(lambda: Frames(self, *rows_in_time(self)))
         index = self.index()
         if self.spec.poses is None:
             return Frames(self, index, self._fixating(index))
@@ -657,7 +661,14 @@ class Scene:
         """
         if self.spec.sequence is None:
             raise InputError("is missing; only a sequence has times", source=self.source, path="sequence")
-        return Frames(self, *rows_at(self, time_s))
+        return self._placed(lambda: Frames(self, *rows_at(self, time_s)))
+
+    def _placed(self, made: Callable[[], Frames]) -> Frames:
+        """Make frames; errors name the scene's file."""
+        try:
+            return made()
+        except InputError as error:
+            raise error.placed(source=self.source) from None
 
     @property
     def timings(self) -> tuple[FrameTimes, ...]:

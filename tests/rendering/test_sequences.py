@@ -133,3 +133,13 @@ def test_torsion_turns_the_iris_by_itself(renderer):
     assert np.count_nonzero(both) > 1000
     centre = np.abs(scene.eye("right").stop.centre_mm[1:]).max()
     assert abs(abs(np.median(turns)) - 5.0) < 1e-4 + 5 * centre
+
+
+def test_a_rolling_shutter_before_a_moving_eye_is_valid(renderer, tmp_path):
+    """Masks, outlines of pupil and limbus, and records agree, each at the time of its rows."""
+    scene = in_time(sequence=turning(300.0, -3.0, 0.02), camera=SLOW_ROWS, region=None, **SMALL)
+    er.render_folder(scene, tmp_path / "out")
+    found = er.validate(tmp_path / "out")
+    assert found["problems"] == []
+    lines = [entry.line for entry in er.ImageFolder.load(tmp_path / "out")]
+    assert all(line["records"][0]["pupil"]["time_s"] != line["time_s"] for line in lines)

@@ -184,6 +184,9 @@ def test_noise_of_a_trace_has_its_size_and_type():
         (["-o", "t.csv"], "--rate: is needed with --output"),
         (["--rate", "100", "-o", "t.csv"], "a trace needs a sequence"),
         (["--rate", "1e9", "-o", "t.csv"], "--rate: must be 0 to 100000"),
+        (["--noise-px", "0.1"], "--noise-px: needs --rate"),
+        (["--rate", "100", "-o", "t.csv", "--noise-deg", "1"], "--noise-deg: is noise of the gaze"),
+        (["--rate", "100", "-o", "t.asc", "--format", "asc", "--noise-px", "1"], "--noise-px: is noise of features"),
     ],
 )
 def test_a_wrong_trace_ends_with_one_line(arguments, message, capsys, tmp_path, monkeypatch):
@@ -233,3 +236,14 @@ def test_gaze_on_targets_of_the_rig_is_judged_in_its_frame():
     np.testing.assert_allclose(np.linalg.norm(gap, axis=1), np.linalg.norm(gap[0]), atol=1e-9)
     assert not inside.index.head_mm.any()
     np.testing.assert_array_equal(inside.pupil.centre_px, seen.pupil.centre_px)  # features do not know
+
+
+def test_a_scene_in_time_is_drawn_and_warns_of_frames_that_overlap(tmp_path):
+    scene = in_time(
+        "eyelink_desktop", {"duration_s": 0.1}, camera={"frame_rate_hz": 500.0}, sensor={"exposure_ms": 4.0}
+    )
+    assert "frame-rate" in {warning.code for warning in scene.warnings()}
+    assert "frame-rate" not in {warning.code for warning in er.load_scene("eyelink_desktop").warnings()}
+    scene.spec.dump(tmp_path / "scene.yaml")
+    assert run(["view", "scene", str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "scene.svg")]) == 0
+    assert (tmp_path / "scene.svg").stat().st_size > 1000

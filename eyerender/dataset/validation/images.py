@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,13 @@ from ...folders.imagefolder import ImageEntry
 from ...imaging.labels import moments_ellipse, whole_pixels
 from ...rig.camera import PinholeCamera, Window
 from ...scene.parts import FRAME, IRIS, PUPIL, SPECTACLES
-from .outline import EXACT_PX, LIMBUS_PX, PUPIL_PX, Outline
+from .outline import EXACT_PX, LIMBUS_PX, MOMENT_PX, PUPIL_PX, Outline
 from .problems import differences
 
 SKIN, SCLERA = 0, 1
 _RIMS = 11  # instance of the frame of spectacles
 _VISIBLE = 1e-8  # relative; numbers of packed lines are rounded to 5e-9
+_SAME_S = 1e-9  # times that differ by less are equal
 _UNIT, _FACING = 1e-3, 1e-3  # of normals, which half precision rounds by up to 5e-4
 _EDGES = 1e-3  # share of pixels in which two rays through one place may meet different sides of an edge
 Mask = NDArray[Any]
@@ -160,6 +162,10 @@ def _outlines(
     """
     labels = line.get("labels", {})
     pupil, iris = pupil_outline(line), iris_outline(line, limbus_px)
+    if _has_own_times(line):
+        pupil, iris = (
+            None if o is None else replace(o, tolerance_px=o.tolerance_px + MOMENT_PX) for o in (pupil, iris)
+        )
     shares = [_share(labels, name) for name in ("pupil", "iris")]
     # The iris' visible fraction ignores what hides the pupil, so both must be whole.
     bare = all(share is not None and share >= 1.0 for share in shares)
@@ -182,6 +188,12 @@ def _outlines(
             seen = np.count_nonzero((whole == part) & (mask == part))
             if share is not None and (not there or abs(share - seen / there) > 2 * _VISIBLE):
                 yield f"the visible fraction of its {name} does not match its masks"
+
+
+def _has_own_times(line: dict[str, Any]) -> bool:
+    """Return whether rows are exposed at their own times, so that masks are put together from moments."""
+    seen = [part["time_s"] for record in line["records"] for part in (record["pupil"], *record["glints"])]
+    return any(time_s is not None and abs(time_s - line["time_s"]) > _SAME_S for time_s in seen)
 
 
 def _compare(name: str, shown: Bools, not_shown: Bools, outline: Outline, window: Window) -> Iterator[str]:

@@ -16,6 +16,8 @@ EXACT_PX = 0.05
 # Tolerances where only the best-fitting ellipse is known. The limbus deviates from it by .06 px at most, in E5.
 # Irregular pupils and pupils seen from the side deviate by up to 1.05 px.
 LIMBUS_PX, PUPIL_PX = 0.25, 1.5
+# Moments of a moving picture are at most half a pixel apart, and each row of a mask is that of the nearest one.
+MOMENT_PX = 0.3
 _POINTS = 360
 
 

@@ -171,6 +171,10 @@ class GazeModel(Spec):
     def _one_kind(self) -> Self:
         if sum(given is not None for given in (self.targets, self.screen_mm, self.grid)) > 1:
             raise ValueError("give only one of targets, screen_mm and grid")
+        listed = self.targets or self.screen_mm or self.grid
+        for name in ("field_deg", "distance_mm") if listed else ():
+            if name in self.model_fields_set:
+                raise ValueError(f"{name}: is of drawn targets, and cannot stand beside listed ones")
         return self
 
     def torsion_at(self, times_s: Floats) -> Floats:
