@@ -173,7 +173,7 @@ class GazeModel(Spec):
             raise ValueError("give only one of targets, screen_mm and grid")
         listed = self.targets or self.screen_mm or self.grid
         for name in ("field_deg", "distance_mm") if listed else ():
-            if name in self.model_fields_set:
+            if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: is of drawn targets, and cannot stand beside listed ones")
         return self
 
