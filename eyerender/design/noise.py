@@ -121,7 +121,7 @@ def extracted_noise(noise: FeatureNoise) -> FeatureNoise:
     """Compute the noise of the features that `extract` finds, from that of the sensor.
 
     The extractor's own edges and fits add to it: outline_px becomes sqrt((a outline_px)^2 + b^2), and so do glints. The
-    constants were fitted on rendered frames, and checked on others (`scripts/bench_noise.py`).
+    constants were chosen with rendered frames (`scripts/bench_noise.py`).
     """
     outline, glint = (
         np.hypot(a * known, b)

@@ -239,9 +239,8 @@ def test_gaze_on_targets_of_the_rig_is_judged_in_its_frame():
 
 
 def test_a_scene_in_time_is_drawn_and_warns_of_frames_that_overlap(tmp_path):
-    scene = in_time(
-        "eyelink_desktop", {"duration_s": 0.1}, camera={"frame_rate_hz": 500.0}, sensor={"exposure_ms": 4.0}
-    )
+    fast = {"frame_rate_hz": 500.0}
+    scene = in_time("eyelink_desktop", {"duration_s": 0.1}, camera=fast, sensor={"exposure_ms": 4.0})
     assert "frame-rate" in {warning.code for warning in scene.warnings()}
     assert "frame-rate" not in {warning.code for warning in er.load_scene("eyelink_desktop").warnings()}
     scene.spec.dump(tmp_path / "scene.yaml")
