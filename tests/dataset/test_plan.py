@@ -34,6 +34,7 @@ def test_shipped_specs_load_and_come_back_from_their_own_yaml(tmp_path):
         "dataset_glasses",
         "dataset_quick",
         "dataset_region",
+        "dataset_sequence",
         *sorted((*PEOPLE, *HEADSETS)),
     ]
     for name, path in shipped_datasets().items():

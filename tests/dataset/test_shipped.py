@@ -33,7 +33,8 @@ def small(name):
     if "grid" in data["targets"]:
         data["targets"] = {"grid": [2, 2]}
     else:
-        data["targets"] = {kind: [points[0], points[-1]] for kind, points in data["targets"].items()}
+        points = {kind: found for kind, found in data["targets"].items() if isinstance(found, list)}
+        data["targets"] = {kind: [found[0], found[-1]] for kind, found in points.items()}
     heads = data["subject"]["head_positions_mm"]
     data["subject"]["head_positions_mm"] = heads if len(heads) == 1 else [heads[0], heads[-1]]
     return Scene.of(SceneSpec.from_mapping(data))
@@ -43,6 +44,8 @@ def few(name):
     """A shipped dataset spec with one sample a pixel, two subjects and four samples."""
     data = DatasetSpec.load(shipped_datasets()[name]).to_mapping()
     data |= {"count": 4, "subjects": 2, "shard_size": 2}
+    if "sequence" in data["scene"]:
+        data["planned"], data["scene"]["sequence"]["duration_s"] = 4, 2 / 60  # two clips of two frames
     data["scene"]["image"]["spp"] = 1
     return Plan.of(DatasetSpec.from_mapping(data))
 
@@ -83,7 +86,7 @@ def test_eyes_seen_from_the_side_validate(eye, tmp_path):
 def test_all_are_covered():
     assert NAMES == [
         "bench_world", "blignaut2014", "dataset_binocular", "dataset_glasses", "dataset_quick", "dataset_region",
-        "desktop_tracker", "eyelink_desktop", "guestrin2006", "head_mounted", "headset", "headset_binocular",
+        "dataset_sequence", "desktop_tracker", "eyelink_desktop", "guestrin2006", "head_mounted", "headset", "headset_binocular",
         "people_any_headset", "people_eyelink", "people_iris_camera", "people_nvgaze", "people_openeds",
         "people_pupil_core", "people_two_cameras", "quickstart", "stress", "webcam",
     ]  # fmt: skip
