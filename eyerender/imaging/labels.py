@@ -70,6 +70,8 @@ class EyeInWindow:
         index, scene = frames.index, frames.scene
         camera, head, side = int(index.camera[row]), int(index.head[row]), int(index.eye[row])
         M, t = eye_motion(frames, row)
+        # The file of a head mesh, which has no lids to label, is not read.
+        has_lids = scene.spec.region is not None and scene.spec.region.head is None
         return cls(
             row=row,
             camera=camera,
@@ -79,7 +81,7 @@ class EyeInWindow:
             t=t,
             apex_mm=rest_mm(frames, row),
             rig=scene.rig_at(index, row),
-            region=scene.region_at(index, row),
+            region=scene.region_at(index, row) if has_lids else None,
             frame=frames.take([row]),
         )
 

@@ -86,9 +86,9 @@ def test_eyes_seen_from_the_side_validate(eye, tmp_path):
 def test_all_are_covered():
     assert NAMES == [
         "bench_world", "blignaut2014", "dataset_binocular", "dataset_glasses", "dataset_quick", "dataset_region",
-        "dataset_sequence", "desktop_tracker", "eyelink_desktop", "guestrin2006", "head_mounted", "headset", "headset_binocular",
-        "people_any_headset", "people_eyelink", "people_iris_camera", "people_nvgaze", "people_openeds",
-        "people_pupil_core", "people_two_cameras", "quickstart", "stress", "webcam",
+        "dataset_sequence", "desktop_tracker", "eyelink_desktop", "guestrin2006", "head_mounted", "headset",
+        "headset_binocular", "people_any_headset", "people_eyelink", "people_iris_camera", "people_nvgaze",
+        "people_openeds", "people_pupil_core", "people_two_cameras", "quickstart", "stress", "webcam",
     ]  # fmt: skip
 
 

@@ -162,7 +162,7 @@ def test_a_dataset_draws_its_subjects():
         found = realise(plan, index)
         assert found.scene.spec.person == people.person(index // 2)
         row = index % 2
-        labels = {"pupil": {"stop_diameter_mm": found.scene.stop_diameter_mm("right")}}
+        labels = {"pupil": {"stop_diameter_mm": found.scene.stop_diameter_mm(("right", "left")[row])}}
         _, line = sample_line(found, row, 1, windows_of(found.scene, found.observations)[row], labels)
         told = line["parameters"]["person"]
         assert told["axial_length_mm"] == people["axial_length_mm"][index // 2, row]
