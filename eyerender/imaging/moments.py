@@ -55,8 +55,8 @@ def _at_constant_speed(frames: RenderableFrames, row: int, motion: Motion, middl
     from ..rendering.records.job import SubFrames
 
     pose, sensor = frames.pose, frames.scene.spec.sensor
+    delay = frames.scene.timings[frames.index.camera[row]].field_delay_s
     during = ((np.arange(motion.steps) + 0.5) / motion.steps - 0.5) * sensor.time_ms * 1e-3
-    delay = sensor.field_delay_ms * 1e-3
     out = []
     for k, time_s in enumerate(np.concatenate([during - delay / 2, during + delay / 2]) if delay else during):
         azimuth = pose.azimuth_rad[row] + np.radians(motion.eye_deg_s[0]) * time_s
@@ -89,7 +89,8 @@ def _in_sequence(
     rows = np.arange(middle.window[3]) + middle.window[1]
     edges, on = timing.segments(int(rows[0]), int(rows[-1]), lights)
     counts = [_steps_of(frames, row, middle, start + low, start + high) for low, high in pairwise(edges)]
-    if len(counts) == 1 and counts[0] == 1 and on.all():
+    whole = counts[0] if len(counts) == 1 else _steps_of(frames, row, middle, start + edges[0], start + edges[-1])
+    if whole == 1 and on.all():
         return ()
     parts, labelled = [], _Labelled(timing.seen([start], rows[None], lights).time_s[0], start, edges, counts)
     moves = sum(counts) > len(counts)
@@ -108,10 +109,11 @@ def _in_sequence(
                 seed = int(np.random.SeedSequence([middle.seed, k, n]).generate_state(1, np.uint64)[0])
             jobs.append(replace(job, lights=dimmed, seed=seed, labels=False))
         shares = timing.shares(inner, rows)
-        if timing.is_rolling:
+        if timing.is_rolling or timing.field_delay_s:
             parts += [
-                SubFrames(jobs=(job,), rows=share, labelled=labelled.rows(k, n))
+                SubFrames(jobs=(job,), rows=share, labelled=labelled.rows(k, n) if timing.is_rolling else None)
                 for n, (job, share) in enumerate(zip(jobs, shares, strict=True))
+                if share.any()
             ]
         else:
             whole = shares.sum(axis=0)

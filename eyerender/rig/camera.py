@@ -46,7 +46,7 @@ from .distortion import (
 from .mirror import Mirror as Mirror
 from .mirror import MirrorPlate
 from .opencv import read_opencv
-from .timing import DEFAULT_RATE_HZ, FrameTimes, Rolling, Shutter
+from .timing import DEFAULT_RATE_HZ, FrameTimes, Interlaced, Rolling, Shutter
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 Pixels = Annotated[int, Field(gt=0, le=65536)]
@@ -191,8 +191,8 @@ class Camera(Spec):
     )
     shutter: Shutter | None = Field(
         default=None,
-        description="`global`: all rows are exposed at once; or `{rolling: {row_us: R}}`: one after the other, visible "
-        "with a `sequence`; default: global",
+        description="`global`: all rows are exposed at once; `{rolling: {row_us: R}}`: one after the other, visible "
+        "with a `sequence`; or `{interlaced: {delay_ms: D}}`: odd rows later; default: global",
     )
 
     @classmethod
@@ -331,6 +331,7 @@ class Camera(Spec):
             row_s=rolling,
             rows=self.resolution_px[1],
             pulses_s=pulses_s,
+            field_delay_s=self.shutter.interlaced.delay_ms * 1e-3 if isinstance(self.shutter, Interlaced) else 0.0,
         )
 
     def unmirrored(self) -> PinholeCamera:

@@ -101,11 +101,6 @@ class Sensor(Spec):
     jpeg_quality: Annotated[int, Field(ge=5, le=100)] | None = Field(
         default=None, description="quality of the JPEG compression that 8-bit codes pass through; default: none"
     )
-    field_delay_ms: NonNegative = Field(
-        default=0.0,
-        description="delay of an interlaced camera's second field: odd rows are exposed so much later than even ones "
-        "(NTSC 16.7 ms, PAL 20 ms); visible with `motion`. 0: all rows are exposed at once",
-    )
     border_px: tuple[Border, Border, Border, Border] = Field(
         default=(0, 0, 0, 0),
         description="columns and rows without a picture at the left, top, right and bottom of the sensor: letterboxes, "

@@ -7,8 +7,9 @@ middle of the overlap. LEDs without a pulse, and all other light, are always on.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,9 +37,30 @@ class Rolling(Spec):
     rolling: RollingShutter = Field(description="its rows")
 
 
+class InterlacedShutter(Spec):
+    """Odd rows are exposed later than even ones, as two fields."""
+
+    delay_ms: NonNegative = Field(description="delay of the second field (NTSC 16.7 ms, PAL 20 ms)")
+
+
+class Interlaced(Spec):
+    """An interlaced camera."""
+
+    interlaced: InterlacedShutter = Field(description="its fields")
+
+
+def _shutter_tag(value: Any) -> str:
+    if isinstance(value, str):
+        return "TextSpec"
+    named = isinstance(value, Interlaced) or (isinstance(value, Mapping) and "interlaced" in value)
+    return "[interlaced]" if named else "[rolling]"
+
+
 Shutter = Annotated[
-    Annotated[Literal["global"], Tag("TextSpec")] | Annotated[Rolling, Tag("[rolling]")],
-    Discriminator(lambda value: "TextSpec" if isinstance(value, str) else "[rolling]"),
+    Annotated[Literal["global"], Tag("TextSpec")]
+    | Annotated[Rolling, Tag("[rolling]")]
+    | Annotated[Interlaced, Tag("[interlaced]")],
+    Discriminator(_shutter_tag),
 ]
 
 
@@ -72,6 +94,7 @@ class FrameTimes(ArrayValue):
         exposure_s: exposure time of a row.
         row_s: time from row to row; 0 with a global shutter.
         rows: number of rows.
+        field_delay_s: how much later odd rows are exposed than even ones; features are those midway between both.
         pulses_s: (m, 2) start and end of the pulse of each light, after the start of a frame; -inf and inf without one.
     """
 
@@ -82,6 +105,7 @@ class FrameTimes(ArrayValue):
     row_s: float
     rows: int
     pulses_s: Floats
+    field_delay_s: float = 0.0
 
     @property
     def is_rolling(self) -> bool:
@@ -99,11 +123,11 @@ class FrameTimes(ArrayValue):
     def ambient_s(self, start_s: ArrayLike, row: ArrayLike) -> Floats:
         """Return the middle of the exposure of rows, which may be fractions; a row below 0 is the first one."""
         inside = np.clip(np.asarray(row, dtype=float), 0.0, self.rows - 1.0)
-        return np.asarray(np.asarray(start_s) + inside * self.row_s + self.exposure_s / 2.0)
+        return np.asarray(np.asarray(start_s) + inside * self.row_s + (self.field_delay_s + self.exposure_s) / 2.0)
 
     def lit(self, start_s: ArrayLike, row: ArrayLike, light: int) -> Light:
         """Return what rows (n, k) of frames that start at (n,) get of a light; rows may be fractions."""
-        begin = np.clip(np.asarray(row, dtype=float), 0.0, self.rows - 1.0) * self.row_s
+        begin = np.clip(np.asarray(row, dtype=float), 0.0, self.rows - 1.0) * self.row_s + self.field_delay_s / 2.0
         low = np.maximum(begin, self.pulses_s[light, 0])
         high = np.minimum(begin + self.exposure_s, self.pulses_s[light, 1])
         share = np.maximum(high - low, 0.0) / self.exposure_s
@@ -123,20 +147,21 @@ class FrameTimes(ArrayValue):
         return Light(np.where(total > 0.0, weighted / np.where(total > 0.0, total, 1.0), np.nan), total)
 
     def segments(self, first_row: int, last_row: int, lights: Ints) -> tuple[Floats, Bools]:
-        """Divide the exposure of some rows at the edges of pulses.
+        """Divide the exposure of some rows at the edges of pulses and fields.
 
         Returns:
             Edges (k + 1,) in s after the frame's start, and which lights (k, m) are on between them.
         """
-        begin, end = first_row * self.row_s, last_row * self.row_s + self.exposure_s
+        begin, end = first_row * self.row_s, last_row * self.row_s + self.field_delay_s + self.exposure_s
         pulses = self.pulses_s[lights]
         inside = pulses[(pulses > begin) & (pulses < end)]
-        edges = np.unique(np.concatenate([[begin], inside, [end]]))
+        fields = np.array([self.exposure_s, self.field_delay_s] if self.field_delay_s else [])
+        edges = np.unique(np.concatenate([[begin], inside, fields[(fields > begin) & (fields < end)], [end]]))
         middle = (edges[:-1] + edges[1:]) / 2.0
         return edges, (middle[:, None] > pulses[None, :, 0]) & (middle[:, None] < pulses[None, :, 1])
 
     def shares(self, edges_s: Floats, rows: Ints) -> Floats:
         """Return the share of each row's exposure (k, rows) between edges (k + 1,), in s after the frame's start."""
-        begin = rows * self.row_s
+        begin = rows * self.row_s + (rows % 2) * self.field_delay_s
         inside = np.clip(edges_s[:, None], begin, begin + self.exposure_s)
         return np.asarray(np.diff(inside, axis=0) / self.exposure_s)

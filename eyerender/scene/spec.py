@@ -328,8 +328,6 @@ class SceneSpec(FileSpec):
         gaze = self.sequence.gaze if self.sequence is not None else None
         if isinstance(gaze, GazeModel) and (gaze.grid or gaze.screen_mm) and self.rig.screen is None:
             raise KeyProblem("sequence.gaze", "targets on a screen need rig.screen")
-        if self.sensor.field_delay_ms:
-            raise KeyProblem("sensor.field_delay_ms", "cannot stand beside a sequence so far")
         lenses = [lens for side in EYES for lens in lenses_of(self.subject.spectacles, side)]
         if any(lens.mount == "rig" for lens in lenses):
             raise KeyProblem("subject.spectacles", "cannot have mount: rig with a sequence so far")

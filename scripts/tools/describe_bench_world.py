@@ -45,7 +45,7 @@ def describe(found: Any) -> dict[str, float]:
         "radius_px": math.sqrt(float(np.prod(pupil.semi_axes_px[0]))) if pupil.ok[0] else math.nan,
         "px_per_mm": float(scale),
         "speed_deg_s": math.hypot(*spec.motion.eye_deg_s) if spec.motion else 0.0,
-        "field_delay_ms": spec.sensor.field_delay_ms,
+        "field_delay_ms": 1e3 * scene.timings[0].field_delay_s,
         "window": float(bool(spec.ambient and spec.ambient.panels)),
         "exposure": exposure(spec),
         "psf_px": spec.sensor.psf_sigma_px,

@@ -61,12 +61,16 @@ def test_every_hard_case_has_its_share(drawn):
 def test_a_few_per_cent_are_interlaced_and_show_two_moments(drawn):
     plan, _ = drawn
     scenes = [plan.draw(i).scene for i in range(plan.spec.count)]
-    interlaced = [s for s in scenes if s["sensor"]["field_delay_ms"]]
+
+    def delay_ms(scene):
+        return scene["rig"]["cameras"][0]["shutter"]["interlaced"]["delay_ms"]
+
+    interlaced = [s for s in scenes if delay_ms(s)]
     assert 0.02 < len(interlaced) / len(scenes) < 0.08
     for scene in interlaced:
         sensor, camera = scene["sensor"], scene["rig"]["cameras"][0]
-        assert sensor["field_delay_ms"] >= sensor["exposure_ms"]  # the first field ends before the second begins
-        turn = np.radians(np.hypot(*scene["motion"]["eye_deg_s"])) * 1e-3 * sensor["field_delay_ms"]
+        assert delay_ms(scene) >= sensor["exposure_ms"]  # the first field ends before the second begins
+        turn = np.radians(np.hypot(*scene["motion"]["eye_deg_s"])) * 1e-3 * delay_ms(scene)
         assert turn * 10.5 * camera["focal_length_px"] / 400 > 1.0  # px; the pupil is 10.5 mm from the eye's centre
 
 

@@ -51,7 +51,8 @@ def test_conditions_of_a_scene():
     assert of_scene(line(49.0), PUPIL, corner) == set()
     assert of_scene(line(51.0, 1.9), PUPIL, corner) == {"view > 50 deg", "pupil < 2 mm"}
     assert of_scene(line(0.0, 6.6), PUPIL, corner) == {"pupil > 6.5 mm"}
-    comb = {"motion": {"eye_deg_s": [300.0, 0.0]}, "sensor": {"exposure_ms": 0.1, "field_delay_ms": 20.0}}
+    comb = {"motion": {"eye_deg_s": [300.0, 0.0]}, "sensor": {"exposure_ms": 0.1}}
+    comb["rig"] = {"cameras": [{"shutter": {"interlaced": {"delay_ms": 20.0}}}]}
     assert of_scene(line(0.0, **comb), PUPIL, corner) == {"interlaced"}
     fast = {"motion": {"eye_deg_s": [300.0, 0.0]}, "sensor": {"exposure_ms": 5.0, "jpeg_quality": 20}}
     assert of_scene(line(0.0, **fast), PUPIL, corner) == {"motion", "strong JPEG"}

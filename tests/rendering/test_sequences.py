@@ -143,3 +143,20 @@ def test_a_rolling_shutter_before_a_moving_eye_is_valid(renderer, tmp_path):
     assert found["problems"] == []
     lines = [entry.line for entry in er.ImageFolder.load(tmp_path / "out")]
     assert all(line["records"][0]["pupil"]["time_s"] != line["time_s"] for line in lines)
+
+
+def test_fields_of_an_interlaced_camera_show_the_eye_one_after_the_other(renderer):
+    """Even rows are those of a sharp picture at the first field's exposure, odd rows of one at the second's."""
+    delayed = {"shutter": {"interlaced": {"delay_ms": 5.0}}, "frame_rate_hz": 50.0}
+    picture_of = {"spp": 32, "window_px": [160, 120]}
+    short = {"image": picture_of, "sensor": {"noise": False, "exposure_ms": 0.2}, "region": None}
+    scene = in_time(sequence=turning(200.0, -2.0, 0.04), camera=delayed, **short)
+    both, frames = picture(scene, 0, renderer), scene.frames()
+    assert frames.index.time_s[0] == pytest.approx(2.6e-3)  # midway between the fields
+    alone = in_time(sequence=turning(200.0, -2.0, 0.04), camera={"frame_rate_hz": 50.0}, **short)
+    for parity, middle_s in ((0, 0.1e-3), (1, 5.1e-3)):
+        still = alone.with_(gaze_deg=[-2.0 + 200 * middle_s, 0.0]).frames()
+        (sharp,) = er.render_windows(still, renderer=renderer)
+        rows = (np.arange(both.window[3]) + both.window[1]) % 2 == parity
+        error = both.irradiance[rows] - sharp.irradiance[rows]
+        assert np.sqrt(np.mean(error**2)) < 0.02 * np.sqrt(np.mean(sharp.irradiance[rows] ** 2))

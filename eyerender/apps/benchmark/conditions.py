@@ -60,6 +60,14 @@ def of_shape(pupil: Ellipse | None, visible: float | None, size: tuple[int, int]
     return out
 
 
+def _field_delay_ms(scene: Mapping[str, Any], camera: int) -> float:
+    """Return by how much an interlaced camera of a scene's keys exposes its odd rows later."""
+    cameras = (scene.get("rig") or {}).get("cameras") or []
+    shutter = cameras[camera].get("shutter") if camera < len(cameras) else None
+    fields = shutter.get("interlaced") if isinstance(shutter, Mapping) else None
+    return float((fields or {}).get("delay_ms") or 0.0)
+
+
 def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> set[str]:
     """Return conditions that follow from a dataset's metadata; `corner` (2,) is the image's position on the sensor."""
     labels, parameters = line.get("labels") or {}, line.get("parameters") or {}
@@ -85,7 +93,7 @@ def of_scene(line: Mapping[str, Any], pupil: Ellipse | None, corner: Floats) -> 
     speed_px_ms *= _ROTATION_MM * float(seen_by.K[0, 0]) / distance
     if speed_px_ms * float(sensor.get("exposure_ms") or 0.0) > _MOVES_PX:
         out.add("motion")
-    if speed_px_ms * float(sensor.get("field_delay_ms") or 0.0) > _MOVES_PX:
+    if speed_px_ms * _field_delay_ms(scene, parameters.get("camera") or 0) > _MOVES_PX:
         out.add("interlaced")
     if sensor.get("jpeg_quality") is not None and sensor["jpeg_quality"] < _QUALITY:
         out.add("strong JPEG")

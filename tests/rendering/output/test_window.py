@@ -17,7 +17,7 @@ from eyerender.scene.spec import SceneSpec
 pytestmark = pytest.mark.render
 
 
-def shot(renderer, **more):
+def shot(renderer, shutter="global", **more):
     scene = Scene.of(
         SceneSpec.from_mapping(
             {
@@ -27,7 +27,7 @@ def shot(renderer, **more):
                 "rig": {
                     "cameras": [
                         {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 5000,
-                         "resolution_px": [640, 480]}
+                         "resolution_px": [640, 480], "shutter": shutter}
                     ],
                     "lights": [
                         {"position_mm": [600, 100, 0], "radius_mm": 0, "aim_mm": [0, 0, 0], "intensity_mw_sr": 100}
@@ -123,8 +123,8 @@ def test_a_moving_head_smears_the_glint_about_its_place(renderer):
 def test_rows_of_an_interlaced_camera_show_two_moments(renderer):
     still = shot(renderer)
     short = shot(renderer, sensor={"exposure_ms": 0.5})
-    sensor = {"exposure_ms": 0.5, "field_delay_ms": 10.0}
-    comb = shot(renderer, sensor=sensor, motion={"head_mm_s": [0, 100, 0], "steps": 2})
+    fields = {"interlaced": {"delay_ms": 10.0}}
+    comb = shot(renderer, fields, sensor={"exposure_ms": 0.5}, motion={"head_mm_s": [0, 100, 0], "steps": 2})
 
     def place(image, parity):
         rows = np.arange(image.irradiance.shape[0]) % 2 == (parity + image.window[1]) % 2
