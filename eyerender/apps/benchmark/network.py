@@ -4,16 +4,18 @@ The only input is a float32 tensor (1 or any, 1, h, w): a grey picture whose lev
 picture is fitted into h x w px without a change of its proportions, in the middle of zeros, as by `size` of
 `eyerender.torch.FolderDataset`. Two outputs are read: `pupil_ellipse` (1, 5), which is x, y, a, b in px of that picture
 (pixel centres at integers) and the angle of a in rad from +x towards +y; and `confidence` (1, 1), 0 to 1. A pupil with
-a confidence below 0.5 is missing. The metadata of the file hold `eyerender: network/1`, which stands for this
-meaning of its numbers.
+a confidence below 0.5 is missing, and its ellipse may be anything. The metadata of the file hold `eyerender:
+network/1`, which stands for this meaning of its numbers.
 
-Files come from anybody: no file beside them is opened, and operators that ONNX Runtime does not know are refused.
+Files come from anybody: no file beside them is opened, operators that ONNX Runtime does not know are refused, and so is
+a network whose first run, on a grey ramp, takes more than 20 s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from threading import Timer
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,6 +30,7 @@ KEY, VERSION = "eyerender", "network/1"
 OUTPUTS = {"pupil_ellipse": 5, "confidence": 1}
 LARGEST_BYTES = 2**29
 _LARGEST_PX = 4096
+_TRIAL_S = 20.0  # longest first run of a network
 _SURE = 0.5
 
 
@@ -69,18 +72,24 @@ class NetworkExtractor:
             }
         }
 
-    def run(self, levels: Singles) -> tuple[NDArray[np.float64], float]:
+    def run(self, levels: Singles, options: Any = None) -> tuple[NDArray[np.float64], float]:
         """Run the network on a picture of its size, and return the ellipse (5,) and the confidence.
 
         Raises:
-            ValueError: an output has another size, or is not finite.
+            ValueError: an output has another size, the confidence is not 0 to 1, or the ellipse of a found pupil is not
+                finite.
         """
         name = self.session.get_inputs()[0].name
-        found = self.session.run(list(OUTPUTS), {name: np.ascontiguousarray(levels[None, None])})
+        found = self.session.run(list(OUTPUTS), {name: np.ascontiguousarray(levels[None, None])}, options)
         for (output, count), value in zip(OUTPUTS.items(), found, strict=True):
-            if np.size(value) != count or not np.all(np.isfinite(value)):
-                raise ValueError(f"output {output!r} must hold {count} finite numbers for each picture")
-        return np.asarray(found[0], dtype=float).ravel(), float(np.ravel(found[1])[0])
+            if np.size(value) != count:
+                raise ValueError(f"output {output!r} must hold {count} numbers for each picture")
+        ellipse, confidence = np.asarray(found[0], dtype=float).ravel(), float(np.ravel(found[1])[0])
+        if not 0.0 <= confidence <= 1.0:
+            raise ValueError(f"the confidence must be 0 to 1, not {confidence:g}")
+        if confidence >= _SURE and not np.all(np.isfinite(ellipse)):
+            raise ValueError("the ellipse of a found pupil must be finite")
+        return ellipse, confidence
 
 
 def load_network(path: str) -> NetworkExtractor:
@@ -116,10 +125,18 @@ def load_network(path: str) -> NetworkExtractor:
     except Exception as error:  # ONNX Runtime has a class for each of its codes
         raise InputError(f"ONNX Runtime refuses it ({one_line(str(error), 160)})", source=path) from error
     network = NetworkExtractor(session, _size(session, path))
+    width, height = network.size
+    ramp = np.linspace(0.0, 1.0, width * height, dtype=np.float32).reshape(height, width)
+    limit = onnxruntime.RunOptions()
+    timer = Timer(_TRIAL_S, setattr, (limit, "terminate", True))
+    timer.start()
     try:
-        network.run(np.zeros(network.size[::-1], np.float32))
+        network.run(ramp, limit)
     except Exception as error:
-        raise InputError(f"cannot be run ({one_line(str(error), 160)})", source=path) from error
+        slow = f"it takes more than {_TRIAL_S:g} s" if limit.terminate else one_line(str(error), 160)
+        raise InputError(f"cannot be run on a grey ramp ({slow})", source=path) from error
+    finally:
+        timer.cancel()
     return network
 
 
