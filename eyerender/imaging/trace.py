@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..analytic.observer import AnalyticObserver
-from ..base.arrays import Bools, Floats, Indices
+from ..base.arrays import Bools, Floats, Indices, finite_or_none
 from ..base.errors import InputError
 from ..base.status import Status
 from ..eye.model import EyeModel
@@ -77,10 +77,10 @@ class Trace:
                 EYES[index.eye[k]],
                 *angles[k].tolist(),
                 round(float(stop[k]), 4),
-                _or_none(lids[k]),
+                finite_or_none(lids[k]),
                 index.events[k],
                 index.blink_phase[k],
-                *map(_or_none, spots[k].tolist()),
+                *map(finite_or_none, spots[k].tolist()),
             ]
 
     def to_mapping(self) -> dict[str, Any]:
@@ -241,7 +241,3 @@ def _angle(edge: Floats, centre: Floats, y_mm: Floats) -> Floats:
     share = np.clip((y_mm - a[:, 1]) / (b[:, 1] - a[:, 1]), 0.0, 1.0)
     point = a + share[:, None] * (b - a) - centre
     return np.asarray(np.arctan2(point[:, 2], point[:, 0]))
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

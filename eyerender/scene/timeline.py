@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from ..base.arrays import Floats, Indices, Ints, remembered
 from ..base.errors import InputError
 from ..base.status import Status
-from ..eye.batch import stack_stops
+from ..eye.batch import stack_stops, take_stops
 from ..eye.build import fitting_stop
 from ..eye.fixation import fixations, with_torsion
 from ..eye.model import EyeModel, Stop
@@ -154,7 +154,7 @@ def _exposures(scene: TimedScene, timings: tuple[FrameTimes, ...]) -> _Exposures
     """Return the frames of all cameras that see an eye, joined to instants."""
     sequence = scene.spec.sequence
     assert sequence is not None
-    used = [c for c, camera in enumerate(scene.rig.cameras) if any(map(camera.sees, scene.spec.subject.eyes))]
+    used = _cameras_used(scene)
     starts = {c: _starts_s(scene, timings[c]) for c in used}
     if (count := sum(map(len, starts.values()))) > MAX_OBSERVATIONS:
         raise InputError(f"has {count} frames; a scene may have {MAX_OBSERVATIONS}", path="sequence.duration_s")
@@ -175,6 +175,11 @@ def _exposures(scene: TimedScene, timings: tuple[FrameTimes, ...]) -> _Exposures
     return _Exposures(instant[order], camera[order], number[order], start[order])
 
 
+def _cameras_used(scene: TimedScene) -> list[int]:
+    """Return the numbers of the cameras that see an eye."""
+    return [c for c, camera in enumerate(scene.rig.cameras) if any(map(camera.sees, scene.spec.subject.eyes))]
+
+
 def _starts_s(scene: TimedScene, timing: FrameTimes) -> Floats:
     """Return when (n,) a camera's frames begin: at the user's own times, or at its rate."""
     sequence = scene.spec.sequence
@@ -189,7 +194,7 @@ def instants_of(scene: TimedScene) -> int:
     """Return how many instants a sequence has: the frames of its fastest camera."""
     assert scene.spec.sequence is not None
     timings = scene.timings
-    used = [c for c, camera in enumerate(scene.rig.cameras) if any(map(camera.sees, scene.spec.subject.eyes))]
+    used = _cameras_used(scene)
     return max(len(_starts_s(scene, timings[c])) for c in used)
 
 
@@ -320,13 +325,8 @@ def stops_of(scene: TimedScene, index: Index) -> Stop | None:
     found = stack_stops([_stop(scene, EYES[int(eye)], float(mm)) for eye, mm in keys])
     rows: Indices = back.reshape(-1)
     moved = np.concatenate([np.zeros((len(rows), 1)), np.nan_to_num(shift)], axis=1)
-    return Stop(
-        centre_mm=found.centre_mm[rows] + moved,
-        rotation=found.rotation[rows],
-        semi_axes_mm=found.semi_axes_mm[rows],
-        handed=found.handed[rows],
-        contour=found.contour[rows],
-    )
+    stops = take_stops(found, rows)
+    return replace(stops, centre_mm=stops.centre_mm + moved)
 
 
 def _stop(scene: TimedScene, side: str, diameter_mm: float) -> Stop:
