@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..analytic.observer import AnalyticObserver
-from ..base.arrays import Bools, Floats, Indices, finite_or_none
+from ..base.arrays import Bools, Floats, Indices, Objects, finite_or_none
 from ..base.errors import InputError
-from ..base.status import Status
+from ..base.status import Status, mark
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..region.contour import inner_margins
@@ -134,30 +134,29 @@ def sample_sequence(scene: Scene, tracker: Tracker) -> Trace:
 
 def _on_sensor(seen: Observations) -> Observations:
     """Remove features that lie off the sensor."""
-    glints, off = seen.glints, seen.glints.ok & ~seen.glints.in_image
-    status = np.where(off, Status.NOT_FOUND, glints.status).astype(np.int8)
-    seen = replace(seen, glints=replace(glints, status=status, xy_px=np.where(off[..., None], np.nan, glints.xy_px)))
     outside = seen.pupil.ok & ~seen.pupil.in_image
-    pupil, reason = seen.pupil, seen.pupil.reason.copy()
-    reason[outside] = "off the sensor"
-    status = np.where(outside, Status.NOT_FOUND, pupil.status).astype(np.int8)
-    centre = np.where(outside[:, None], np.nan, pupil.centre_px)
-    return replace(seen, pupil=replace(pupil, status=status, reason=reason, centre_px=centre))
+    reason = np.where(outside, "off the sensor", seen.pupil.reason)
+    return _removed(seen, outside, seen.glints.ok & ~seen.glints.in_image, reason)
 
 
 def _without(seen: Observations, missing: Bools, covered: Bools) -> Observations:
     """Remove the features of rows."""
-    pupil, glints = seen.pupil, seen.glints
-    status, reason = pupil.status.copy(), pupil.reason.copy()
-    status[missing & (status == Status.OK)] = Status.NOT_FOUND
-    reason[missing] = np.where(covered[missing], "occluded by a lid", "lost")
-    centre = np.where(missing[:, None], np.nan, pupil.centre_px)
-    lit = np.where(missing[:, None] & (glints.status == Status.OK), Status.NOT_FOUND, glints.status).astype(np.int8)
-    spots = np.where(missing[:, None, None], np.nan, glints.xy_px)
+    reason = np.where(missing, np.where(covered, "occluded by a lid", "lost"), seen.pupil.reason)
+    return _removed(seen, missing, np.broadcast_to(missing[:, None], seen.glints.status.shape), reason)
+
+
+def _removed(seen: Observations, pupils: Bools, glints: Bools, reason: Objects) -> Observations:
+    """Remove the pupils of rows (n,) and single glints (n, LEDs); what has failed already keeps its status."""
+    pupil, spots = seen.pupil, seen.glints
+    status, lit = pupil.status.copy(), spots.status.copy()
+    mark(status, pupils, Status.NOT_FOUND)
+    mark(lit, glints, Status.NOT_FOUND)
+    centre = np.where(pupils[:, None], np.nan, pupil.centre_px)
+    spots_px = np.where(glints[..., None], np.nan, spots.xy_px)
     return replace(
         seen,
         pupil=replace(pupil, status=status, reason=reason, centre_px=centre),
-        glints=replace(glints, status=lit, xy_px=spots),
+        glints=replace(spots, status=lit, xy_px=spots_px),
     )
 
 
