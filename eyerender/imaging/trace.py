@@ -104,7 +104,7 @@ class Trace:
 def sample_sequence(scene: Scene, tracker: Tracker) -> Trace:
     """Sample a scene's sequence from its start to its end.
 
-    >>> er.sample_sequence(er.load_scene("eyelink_reading"), er.Tracker(rate=500)).observations  # doctest: +SKIP
+    >>> er.sample_sequence(er.load_scene("reading.yaml"), er.Tracker(rate=500)).observations  # doctest: +SKIP
 
     Raises:
         InputError: the scene has no sequence, or the trace would be too long.
