@@ -1,4 +1,4 @@
-"""Every layout of the table in docs/extractor_bench.md, four images each, from the folder to the page at the command."""
+"""Every layout of the table in docs/extractor_bench.md, four images each, from the folder to the page."""
 
 from __future__ import annotations
 
