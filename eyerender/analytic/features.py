@@ -204,11 +204,7 @@ def _stopped(eye: EyeModel, stops: Stop | None, rows: Indices) -> EyeModel:
 
 
 def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> None:
-    """Check the options of `features` for this number of rows.
-
-    Raises:
-        InputError: an option is out of range.
-    """
+    """Raise InputError if an option of `features` is out of range."""
     if boundary_points < 6:
         raise InputError("must be >= 6", path="boundary_points")
     if boundary_points > MAX_BOUNDARY_POINTS:

@@ -142,15 +142,10 @@ def _compile_missing(program: Program) -> None:
 
 
 def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> None:
-    """Compile the functions of a program, except those that other processes claimed.
+    """Compile the functions of a program, except those that other processes claimed by a subfolder of `claims`.
 
     Functions of one module share helpers, which every process has to compile for itself. So workers with even numbers
     begin with the modules of glints and those with odd numbers with the pupil's, the largest module first.
-
-    Args:
-        claims: folder in which a process claims a function by creating a subfolder of the function's name.
-        worker: number of this process.
-        program: what is compiled.
     """
 
     def place(function: Any) -> tuple[bool, int, str]:

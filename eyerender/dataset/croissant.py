@@ -44,9 +44,7 @@ _CONTEXT = Path(__file__).parent / "data" / "croissant_context.json"  # terms of
 def croissant(plan: Plan, sums: Mapping[str, str]) -> dict[str, Any]:
     """Return the Croissant description as JSON-LD.
 
-    Args:
-        plan: the plan of the dataset.
-        sums: SHA-256 of the table of images and, in a packed dataset, of each shard's tar, by name.
+    `sums` are the SHA-256, by name, of the table of images and, in a packed dataset, of each shard's tar.
     """
     spec = plan.spec
     name = "".join(c if c.isalnum() else "_" for c in spec.name)

@@ -110,11 +110,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
 
 
 def read_done(folder: Path, shard: int) -> dict[str, Any]:
-    """Read a finished shard's done.json and check the type of every key.
-
-    Raises:
-        InputError: the file is not valid.
-    """
+    """Read a finished shard's done.json and check the type of every key; InputError if the file is not valid."""
     return read_done_file(folder / SHARDS / shard_name(shard) / DONE)
 
 

@@ -216,11 +216,7 @@ class DatasetSpec(FileSpec):
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Check that a mapping is declared as a dataset.
-
-        Raises:
-            InputError: the mapping is of another kind.
-        """
+        """Check that a mapping is declared as a dataset; InputError if the mapping is of another kind."""
         if data.get("kind") != DATASET_KIND:
             if "rig" in data:
                 raise InputError(NOT_A_DATASET, source=source)

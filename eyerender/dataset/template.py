@@ -301,11 +301,7 @@ def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str,
 
 
 def _refuse_misspelt(node: Mapping[str, Any], source: str, shown: str) -> None:
-    """Raise an error for a mapping that looks like a draw but misspells the key `draw`.
-
-    Raises:
-        InputError: naming the key.
-    """
+    """Raise an error for a mapping that looks like a draw but misspells the key `draw`; InputError naming the key."""
     keys = [key for key in node if isinstance(key, str)]
     if _PARTS.intersection(keys):
         for key in get_close_matches(MARK, [key for key in keys if key not in _PARTS], 1, 0.6):

@@ -69,12 +69,7 @@ class Prepared:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePart:
-    """A part of an image.
-
-    Attributes:
-        linear: (h, w) its levels, DN.
-        corner: column and row of its first pixel.
-    """
+    """A part of an image: its levels (h, w), DN, and column and row of its first pixel."""
 
     linear: Image
     corner: tuple[int, int]
@@ -83,14 +78,8 @@ class ImagePart:
 def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | str:
     """Prepare an image, or return the reason why nothing can be found in it.
 
-    Args:
-        image: (h, w) integers (full scale 2^bit_depth - 1; without bit_depth, that of the type) or floats (any linear
-            scale).
-        bit_depth: bits of an integer image.
-        gamma: the image stores intensity^(1 / gamma).
-
     Raises:
-        InputError: the array is not a single-channel image.
+        InputError: the array is not a single-channel image (see `extract`).
     """
     array = _checked(image)
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10.0):

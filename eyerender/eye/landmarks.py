@@ -41,12 +41,9 @@ def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
 
 
 def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
-    """Compute nodal rays from objects: they reach the retina parallel to their direction in air.
+    """Compute nodal rays from objects (m, 3): they reach the retina parallel to their direction in air.
 
-    Args:
-        eye: the eye.
-        objects_mm: (m, 3) objects.
-        guess_mm: starting point of the search.
+    The search starts at `guess_mm`.
 
     Returns:
         Directions (m, 3) and retina points (m, 3).

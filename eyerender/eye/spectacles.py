@@ -18,7 +18,7 @@ from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Positive, Side, Spec, Vec2
 from ..optics.media import CauchyMedium, SellmeierMedium
 from ..optics.surfaces import Surface
-from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_graph import Biconic
 from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import rotation_x, rotation_y, rotation_z
 from .frames import SpectacleFrame
@@ -205,12 +205,9 @@ class SpectacleLens(Spec):
         return MATERIALS[self.material or "CR-39"].index(wavelength_nm) if self.index is None else self.index
 
     def build(self, side: Side, wavelength_nm: float, head_mm: Floats | None = None) -> WornLens:
-        """Build the lens in the frame of the unrotated eye.
+        """Build the lens of one eye in the frame of the unrotated eye, for rays of a wavelength.
 
-        Args:
-            side: the eye, right or left.
-            wavelength_nm: wavelength at which rays are traced.
-            head_mm: (3,) displacement of the head, which a lens on the rig does not follow; None: none.
+        `head_mm` (3,) is the displacement of the head, which a lens on the rig does not follow.
         """
         solved, nasal = self._solved(), 1.0 if side == "right" else -1.0
         on_rig = self.mount == "rig"
@@ -357,13 +354,9 @@ Spectacles = Annotated[
 
 
 def demand_through_d(lenses: Sequence[SpectacleLens], distance_mm: Floats) -> Floats:
-    """Compute the vergence (D) that targets ask of an emmetropic eye behind lenses, all taken as thin.
+    """Compute the vergence (D) that targets ask of an emmetropic eye behind thin lenses, listed from the eye on.
 
     Light of the vergence V leaves a lens with V + F, and arrives after a distance d with V / (1 - d V).
-
-    Args:
-        lenses: in order from the eye.
-        distance_mm: of the targets from the cornea.
     """
     place = max((lens.vertex_mm for lens in lenses), default=0.0)
     vergence = -1000.0 / np.maximum(distance_mm - place, 1.0)

@@ -149,13 +149,7 @@ def choices(count: int) -> list[Choice]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """A path past worn lenses.
-
-    Attributes:
-        path: the crossings, in order from the viewpoint.
-        owners: number of the lens that each crossing belongs to; None: the eye.
-        lenses: all lenses that are worn.
-    """
+    """A path past worn lenses: its crossings from the viewpoint, and the lens that each belongs to (None: the eye)."""
 
     path: tuple[Crossing, ...]
     owners: tuple[int | None, ...]
@@ -217,11 +211,7 @@ class Course:
         return whole
 
     def follow(self, viewpoint: Xyz, way: Xyz, target: Xyz) -> tuple[Traced, Statuses]:
-        """Trace rays from the viewpoint, and check that they pass lenses inside their outlines only.
-
-        Returns:
-            The traced rays, and their statuses: AT_LENS_EDGE where a lens lies in the way or ends too early.
-        """
+        """Trace rays from the viewpoint; the status is AT_LENS_EDGE where a lens lies in the way or ends too early."""
         traced = trace(self.path, 1.0, join(viewpoint), join(way))
         status = np.array(traced.status)
         points = [viewpoint, *(components(p) for p in traced.points_mm[1:]), target]

@@ -49,11 +49,7 @@ def centres_of(
 ) -> tuple[Floats, Bools]:
     """Compute centres (..., n, 3) of the rows' corneas, each from the glints that it has, and whether it has one.
 
-    Args:
-        rays: rays of all observations.
-        rows: (n,) observations.
-        radius_mm: (..., n) corneal radius.
-        find: the method, `from_all_glints` (default) or `from_plane`.
+    The radius is (..., n); `find` is the method, `from_all_glints` (default) or `from_plane`.
     """
     centre, ok = np.full((*radius_mm.shape, 3), np.nan), np.zeros(radius_mm.shape, dtype=bool)
     for part, columns in with_equal_glints(rays.glints[rows]):

@@ -44,16 +44,10 @@ class FeatureRays(ArrayValue):
 def feature_rays(
     observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, *, least: int
 ) -> FeatureRays:
-    """Compute rays through the pupil centre and the glints.
-
-    Args:
-        observations: n observations.
-        rig: the rig that observed them.
-        lights: lights of the glints, as for `chosen_lights`.
-        least: how many glints an observation must have, and lights the rig.
+    """Compute rays through the pupil centre and the glints of n observations, which need `least` glints or more.
 
     Raises:
-        InputError: the rig has fewer than `least` lights, or not those that are named.
+        InputError: the rig has fewer than `least` lights, or not those that are named (see `chosen_lights`).
     """
     wanted = chosen_lights(observations, rig, lights, least)
     camera, reason = camera_of(observations, rig)

@@ -226,11 +226,7 @@ def _calibration(data: Mapping[str, Any], described: Mapping[str, Any]) -> Built
 
 
 def _own_calibration(data: Mapping[str, Any], reference: object, own: str | None) -> OwnEstimator:
-    """Read the calibration of a user's own class.
-
-    Raises:
-        InputError: `own` is not the class that the file names.
-    """
+    """Read the calibration of a user's own class; InputError if `own` is not the class that the file names."""
     at = "estimator.reference"
     if own is None:
         made_by = f"was made by {shown(reference)}, which no file can have loaded"

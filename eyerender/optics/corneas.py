@@ -7,9 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from ..base.arrays import Floats
-from .surfaces_measured import GridSurface, Measured, ZernikeSurface
+from .surfaces_measured import GridSurface, Measured, ZernikeSurface, order_of, terms
 from .topography import outer_biconic, outer_height, spline_coefficients
-from .zernike import order_of, terms
 
 WINDOW = (0.75, 1.15)
 """Shares of the zone's radius between which the biconic takes over.

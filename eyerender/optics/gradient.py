@@ -113,9 +113,7 @@ class GradientMedium(ArrayValue):
         turns: Sequence[Xyz] = (),
         steps: int | None = None,
     ) -> Passage:
-        """Trace rays from one surface of the medium to the other.
-
-        `hit.ok` is False if a ray leaves the medium through the surface where it entered.
+        """Trace rays between the surfaces of the medium; `hit.ok` is False for one that leaves where it entered.
 
         Args:
             surface: the surface through which the rays leave.

@@ -126,13 +126,13 @@ def purkinje_points(
     positions, or lies beyond the rim of the reflecting surface.
 
     Args:
-        surfaces: outside in; the last one reflects.
+        surfaces: as are the next three and `gradient`, see `purkinje_path`.
         indices: the index behind each surface.
         rims_mm: the rim radius of each surface.
-        passing: see `purkinje_path`.
+        passing: whether a ray that misses a surface continues.
         source_mm: (..., 3) sources.
         viewpoint_mm: (..., 3) viewpoints; they broadcast against the sources.
-        gradient: see `purkinje_path`.
+        gradient: the medium in front of the innermost surface.
         n_outside: index outside the eye.
     """
     path = purkinje_path(surfaces, indices, rims_mm, passing, gradient, n_outside)

@@ -85,12 +85,7 @@ class Graphs:
 
 
 def placed_sheets(place: Floats, turn: Floats) -> Sheets:
-    """Create records (n,) with place and axis of surfaces.
-
-    Args:
-        place: (3,) or (n, 3) origins of the surfaces in the working frame.
-        turn: (3, 3) or (n, 3, 3) rotations from the surfaces' frames to it.
-    """
+    """Create records (n,) with place (3,) or (n, 3) and rotation of surfaces in the working frame."""
     sheets = np.zeros(1 if place.ndim == 1 else len(place), dtype=SHEET)
     sheets["origin"], sheets["axis"], sheets["place"][:, 0] = place, turn[..., :, 0], place[..., 0]
     sheets["cosine"], sheets["sine"] = turn[..., 1, 1], turn[..., 2, 1]

@@ -67,17 +67,11 @@ class Shot(NamedTuple):
 
 
 def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Shot:
-    """Solve for the rays from a source through a path to a target.
+    """Solve for the rays from sources through a path to targets, which broadcast; they are aimed at `aim` first.
 
     Undamped Newton steps are tried for all rays. The rays that do not converge go through a guarded search, in which
-    steps are halved until the miss shrinks. It starts from `aim`, then from points between it and the target.
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium at the source.
-        source: start points of the rays.
-        target: end points of the rays; source and target broadcast.
-        aim: points at which the rays are aimed first.
+    steps are halved until the miss shrinks. It starts from `aim`, then from points between it and the target. `n_start`
+    is the index at the source.
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
     source, target = _spread(source, shape), _spread(target, shape)
@@ -98,17 +92,9 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
 def correct(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
 ) -> Shot:
-    """Refine rays (m,) whose aim is already close, without the guarded search.
+    """Refine rays (m,) whose aim is already close by at most `steps` undamped Newton steps, as `connect` otherwise.
 
     The rays must meet the surfaces, but rims are not checked.
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium at the source.
-        source: (m,) start points of the rays.
-        target: (m,) end points of the rays.
-        aim: (m,) points at which they are aimed first.
-        steps: largest number of undamped Newton steps.
     """
     shot = _undamped(path, n_start, source, target, aim, steps)
     settled = _settled(shot, 100.0) & (shot.residual_mm <= RESIDUAL_LIMIT_MM)
@@ -140,15 +126,7 @@ class RayTube(NamedTuple):
 
 
 def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
-    """Compute the tube of rays around a known ray (see the module).
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium at the source.
-        source: start points of the rays.
-        direction: unit directions of the rays at the source.
-        target: points that the rays pass.
-    """
+    """Compute the tubes, at `target`, of rays with known unit directions at their sources (see the module)."""
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *direction, *target)))
     shot = _shoot(path, n_start, _spread(source, shape), _spread(direction, shape), _spread(target, shape))
     return RayTube(np.abs(shot.determinant_mm2_sr), shot.end)

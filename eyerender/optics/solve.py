@@ -48,12 +48,8 @@ class ApparentPoints(ArrayValue):
 class Rays(NamedTuple):
     """Rays from a viewpoint to a point through surfaces, one array per coordinate.
 
-    Attributes:
-        exit: the point on the outermost surface.
-        way: unit direction from the viewpoint to it.
-        end: unit direction in the last medium.
-        residual_mm: miss distance of the traced ray.
-        status: (...,).
+    `exit` is the point on the outermost surface, `way` the unit direction from the viewpoint to it, and `end` that in
+    the last medium; `residual_mm` is the miss distance of the traced ray.
     """
 
     exit: Xyz
@@ -125,13 +121,8 @@ def mirroring(surface: Surface, rim_mm: FloatLike = np.inf) -> Crossing:
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
     """Compute where a surface reflects a source to a viewpoint outside: the first Purkinje image.
 
-    The residual is measured at 1000 mm if the source is farther away.
-
-    Args:
-        surface: the mirror.
-        source: components of the sources.
-        viewpoint: components of the viewpoints; they broadcast against the sources.
-        rim_mm: rim radius of the surface (the limbus).
+    Sources and viewpoints broadcast. The surface ends at the radius `rim_mm` (the limbus). The residual is measured at
+    1000 mm if the source is farther away.
     """
     return joined_rays((mirroring(surface, rim_mm),), 1.0, viewpoint, source)
 

@@ -121,11 +121,7 @@ class Quadric(Surface):
     ) -> Quadric:
         """Create A x^2 + B y^2 + C z^2 + 2 D xy + 2 E xz + 2 F yz + 2 G x + 2 H y + 2 I z + K = 0, one of its sheets.
 
-        Args:
-            coefficients: A, B, C, D, E, F, G, H, I and K.
-            front: whether it is the sheet where dF/dx > 0 with these coefficients, instead of < 0.
-            origin_mm: place of the frame's origin.
-            rotation: rotation of the frame.
+        `coefficients` are A to K; `front` is the sheet where dF/dx > 0 with them, instead of < 0.
         """
         a, b, c, d, e, f, g, h, i, k = coefficients
         # The scale ties the size of rounding errors to distances, not to the unit of the coefficients.

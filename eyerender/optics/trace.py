@@ -80,14 +80,7 @@ def outward_path(
 
 
 def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:
-    """Trace rays through a path.
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium in which the rays start.
-        origins_mm: (..., 3) origins.
-        directions: (..., 3) unit directions.
-    """
+    """Trace rays (..., 3) with unit directions through a path, from a medium of index `n_start`."""
     point, way = components(origins_mm), components(directions)
     shape = np.broadcast_shapes(point[0].shape, way[0].shape)
     points, ways = [point], [way]

@@ -59,12 +59,7 @@ def prescription(power: Power, side: Side) -> dict[str, float]:
 
 
 def spectacles_of(person: Wearer, **keys: Any) -> dict[str, dict[str, Any]]:
-    """Return `spectacles` with the prescription of each eye and the same other keys (`SpectacleLens`).
-
-    Args:
-        person: the person.
-        keys: keys of the lenses, such as `vertex_mm` or `material`.
-    """
+    """Return `spectacles` with the prescription of each eye and the same other keys, such as `vertex_mm`."""
     v = 1e-3 * float(keys.get("vertex_mm", SpectacleLens.model_fields["vertex_mm"].default))
     out: dict[str, dict[str, Any]] = {}
     for side in EYES:
@@ -78,12 +73,7 @@ def contact_lens_of_person(person: Wearer, **keys: Any) -> dict[str, dict[str, A
 
 
 def worn_by(person: Wearer, share: float) -> dict[str, Any]:
-    """Return the keys `spectacles` or `contact_lens` of a person, or none.
-
-    Args:
-        person: the person.
-        share: share of those who need a correction that wear one.
-    """
+    """Return the keys `spectacles` or `contact_lens` of a person, or none; a `share` of those who need one wear one."""
     rng = np.random.default_rng(person.draw_seed("correction"))
     wears, contact = rng.random(2)
     vertex, tilt, wrap = rng.normal([13.5, 8.0, 5.0], [0.8, 3.0, 2.5]).clip([12.0, 0.0, 0.0], [15.0, 15.0, 12.0])

@@ -115,11 +115,7 @@ class Person(Spec):
         return cls(preset=preset, seed=seed, subject=subject, numbers=plain)
 
     def number(self, name: str, side: Side | None = None) -> float:
-        """Return a number of the person, or of one eye.
-
-        Raises:
-            InputError: there is no such number.
-        """
+        """Return a number of the person, or of one eye; InputError if there is no such number."""
         value = self.numbers.get(name)
         if value is None or isinstance(value, tuple) != (side is not None):
             raise InputError("missing, or not of the right kind", path=f"person.numbers.{name}")

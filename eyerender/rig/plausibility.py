@@ -148,12 +148,7 @@ def place_warnings(
 
 
 def mirror_warnings(cameras: Sequence[Camera], eyes_mm: Mapping[str, Floats]) -> list[InputWarning]:
-    """Warn of a mirror between its camera and an eye that hides the eye instead of showing it.
-
-    Args:
-        cameras: the authored cameras.
-        eyes_mm: corneal apexes (3,) in the world by their name in a message.
-    """
+    """Warn of a mirror between its camera and an eye (named in messages) that hides the eye instead of showing it."""
     found = []
     for k, camera in enumerate(cameras):
         if camera.mirror is None:
@@ -174,10 +169,7 @@ def view_warnings(
 ) -> list[InputWarning]:
     """Warn of cameras whose images show no eye at any head position; a camera without windows is none of them.
 
-    Args:
-        rig: the rig.
-        views: camera -> the windows (x0, y0, width, height) to be rendered, each with the corneal apex (3,) it shows.
-        camera_paths: path of each camera in the input, for messages.
+    `views` are, by camera, the windows to be rendered, each with the corneal apex (3,) it shows.
     """
     seen = {c: [_in_view(rig.cameras[c], window, eye) for window, eye in views[c]] for c in range(len(rig.cameras))}
     blind = [c for c, shown in seen.items() if shown and not any(shown)]

@@ -99,14 +99,9 @@ def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, Pinho
 
 
 def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Add ghost and glare to the image (h, w) of a window, with light from the whole sensor.
+    """Add ghost and glare to the image (h, w) of a window inside the sensor, with light from the whole sensor.
 
-    Args:
-        picture: the window.
-        around: the whole sensor in blocks of `block_px`; the part inside the window is replaced by `picture`.
-        lens: the lens.
-        camera: the camera.
-        window: the window, inside the sensor.
+    `around` is the whole sensor in blocks of `block_px`; the part inside the window is replaced by `picture`.
     """
     side = block_px(lens)
     whole, (x0, y0, width, height) = around.copy(), window

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from eyerender.apps.benchmark.conventions import OPENCV, Conventions
+from eyerender.apps.benchmark.protocol import OPENCV, Conventions
 from eyerender.base.errors import InputError
 from eyerender.optics.ellipse import Ellipse, signed_distance
 

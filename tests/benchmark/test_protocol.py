@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from eyerender.apps.benchmark.conventions import OPENCV, Conventions
-from eyerender.apps.benchmark.protocol import Greeting, Reply, Request
+from eyerender.apps.benchmark.protocol import OPENCV, Conventions, Greeting, Reply, Request
 from eyerender.base.errors import InputError
 
 GOOD = {"status": "ok", "centre_px": [10, 20], "semi_axes_px": [5, 4], "angle_rad": 0.1}

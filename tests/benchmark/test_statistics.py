@@ -10,18 +10,16 @@ import pytest
 from scipy.stats import binom, binomtest
 
 from eyerender.apps.benchmark.asking import ExtractorResults
-from eyerender.apps.benchmark.conventions import Conventions
-from eyerender.apps.benchmark.curves import curves_of
 from eyerender.apps.benchmark.failurekinds import kind_of
 from eyerender.apps.benchmark.glintlabels import TrueGlint
 from eyerender.apps.benchmark.intervals import subject_interval, wilson
 from eyerender.apps.benchmark.labelled import BenchImage
 from eyerender.apps.benchmark.paired import common_errors, pairs_of
-from eyerender.apps.benchmark.protocol import Greeting
+from eyerender.apps.benchmark.protocol import Conventions, Greeting
 from eyerender.apps.benchmark.registry import ExtractorCommand
 from eyerender.apps.benchmark.results import suggested_origin
 from eyerender.apps.benchmark.score import Outcome, Score
-from eyerender.apps.benchmark.summary import bins, summarise
+from eyerender.apps.benchmark.summary import bins, curves_of, summarise
 from eyerender.optics.ellipse import Ellipse
 
 

@@ -173,8 +173,8 @@ def _images(above: int) -> Callable[[Path], Any]:
     def read(path: Path) -> Any:
         import warnings
 
+        from eyerender.dataset.validation.lines import compare_lines
         from eyerender.dataset.validation.problems import FolderProblems
-        from eyerender.dataset.validation.shards import compare_lines
         from eyerender.folders.imagefolder import ImageFolder
 
         with warnings.catch_warnings(action="ignore"):

@@ -250,14 +250,14 @@ def _verdict(path: Path) -> Any:
 
 
 def _answers(path: Path) -> Any:
-    from eyerender.apps.benchmark.answers import Answers
+    from eyerender.apps.benchmark.asking import Answers
 
     known = Answers(path, "x")
     return known.get("x", 0)
 
 
 def _answers_seeds() -> list[bytes]:
-    from eyerender.apps.benchmark.answers import _SCHEMA
+    from eyerender.apps.benchmark.asking import _SCHEMA
 
     first = json.dumps({"schema": _SCHEMA, "task": "x"})
     return [f"{first}\n{json.dumps(['x', 0, '{}', '{}', 0.1])}\n".encode()]

@@ -12,7 +12,7 @@ from eyerender.optics.purkinje import purkinje_points
 from eyerender.optics.shooting import connect
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.surfaces import components, join
-from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_graph import Biconic
 from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import Crossing, inward_path, outward_path, trace
 from eyerender.optics.transforms import tilt_rotation

@@ -12,8 +12,7 @@ from eyerender.eye.parts import PlacedSpec
 from eyerender.eye.surfaces import surface_of
 from eyerender.optics.graphs import graphs_of
 from eyerender.optics.surfaces import components, join
-from eyerender.optics.surfaces_biconic import Biconic
-from eyerender.optics.surfaces_graph import GraphSurface, distances
+from eyerender.optics.surfaces_graph import Biconic, GraphSurface, distances
 from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.transforms import flip_y, tilt_rotation
 from tests.support.corneas import measured_shapes

@@ -7,9 +7,8 @@ import pytest
 from scipy.special import ndtri
 
 from eyerender.base.errors import InputError
-from eyerender.population.correlation import completed, nearest_correlation
 from eyerender.population.marginals import Lognormal, Mixture, Normal, Part, Uniform
-from eyerender.population.model import Model, Reference, default_reference
+from eyerender.population.model import Model, Reference, completed, default_reference, nearest_correlation
 from eyerender.population.table import PopulationTable, default_table
 
 

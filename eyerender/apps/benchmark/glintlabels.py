@@ -75,15 +75,7 @@ class TrueGlint:
 def measured(
     glints: Sequence[TrueGlint], grey: NDArray[Any], bit_depth: int, pupil: Ellipse | None, mask: Bytes | None
 ) -> tuple[TrueGlint, ...]:
-    """Measure size, saturation and place of glints.
-
-    Args:
-        glints: the glints.
-        grey: (h, w) the image.
-        bit_depth: its bits.
-        pupil: the true outline.
-        mask: (h, w) classes of the pixels; None if unknown.
-    """
+    """Measure size, saturation and place of glints in an image (h, w), given the pupil and, if known, the classes."""
     full = np.inf if grey.dtype.kind == "f" else 2**bit_depth - 1
     out = []
     for glint in glints:
@@ -125,14 +117,7 @@ def _place(xy: tuple[float, float], pupil: Ellipse | None, mask: Bytes | None) -
 
 
 def false_kind(xy: tuple[float, float], true: Sequence[TrueGlint], hidden_px: Floats, mask: Bytes | None) -> str:
-    """Classify a report that matches no glint: the first of `FALSE_KINDS` that applies.
-
-    Args:
-        xy: its position.
-        true: glints that the image shows.
-        hidden_px: (n, 2) positions of hidden glints.
-        mask: (h, w) classes of the pixels; None if unknown.
-    """
+    """Classify a report that matches no glint, seen or hidden (n, 2): the first of `FALSE_KINDS` that applies."""
     if any(math.hypot(xy[0] - g.xy_px[0], xy[1] - g.xy_px[1]) < g.match_px for g in true):
         return "repeated"
     if len(hidden_px) and np.hypot(*(hidden_px - xy).T).min() < MATCH_PX:

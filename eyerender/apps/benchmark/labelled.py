@@ -74,12 +74,7 @@ class BenchImage:
     ) -> BenchImage:
         """Read size and bit depth of an image of which the labels alone are known, no camera and no lights.
 
-        Args:
-            name: name of the image.
-            path: file.
-            pupil: its outline; a pupil of which nothing is visible is not shown.
-            visible: visible share of the pupil.
-            labels: further attributes.
+        A pupil of which nothing is visible (share 0) is not shown; `labels` are further attributes.
         """
         image, depth, _ = read_any_image(path)
         height, width = image.shape

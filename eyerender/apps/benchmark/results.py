@@ -17,10 +17,9 @@ import numpy as np
 
 from ...backends.probe import cpu_name
 from .asking import ExtractorResults
-from .curves import curves_of
 from .labelled import BenchImage
 from .score import Score
-from .summary import FACTORS, breakdown, by_condition, failures, sizes, summarise
+from .summary import FACTORS, breakdown, by_condition, curves_of, failures, sizes, summarise
 
 TIMES_SCHEMA = "eyerender/bench-times/1"
 _ORIGIN = (

@@ -14,10 +14,9 @@ from .dependence import Dependence
 from .duplicates import SimilarPair
 from .faults import KINDS
 from .missing import MissingLabels
-from .outliers import Outlier
+from .outliers import Outlier, WorstPicture
 from .reading import Contents
 from .statistics import Distribution, strongest
-from .worst import WorstPicture
 
 _LISTED = 100  # images of each kind of fault in the JSON
 _PAIRS = 40

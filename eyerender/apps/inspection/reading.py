@@ -19,9 +19,8 @@ from ...base.processes import ordered
 from ...base.progress import Progress, notify
 from ...folders.imagefolder import Entries, ImageEntry, ImageFolder, opened_entries
 from ...folders.packed import PackedLines
-from .faults import Fault
+from .faults import Fault, contradictions
 from .figures import groups_of, numbers_of
-from .labels import contradictions
 from .pictures import SIDE, mask_contradictions, measure
 
 _LARGEST = 1e30  # of a number in a column

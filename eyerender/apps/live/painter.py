@@ -174,11 +174,7 @@ class Painter:
     _sample_s: float = 1e-6  # time of the last band per sample
 
     def start(self) -> None:
-        """Start the renderer in its thread.
-
-        Raises:
-            BackendError: no backend renders.
-        """
+        """Start the renderer in its thread; BackendError if no backend renders."""
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(ready,), name="painter", daemon=True)
         self._thread.start()

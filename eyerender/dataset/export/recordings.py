@@ -52,11 +52,7 @@ class Moment:
 
 
 def moment_of(item: Item) -> Moment:
-    """Return the frame of an image.
-
-    Raises:
-        InputError: the image is no frame of a sequence of one eye.
-    """
+    """Return the frame of an image; InputError if the image is no frame of a sequence of one eye."""
     line, records = item.line, item.line["records"]
     if len(records) != 1 or records[0]["events"] is None:
         raise InputError("shows no frame of a sequence of one eye", source=item.entry.name)

@@ -73,13 +73,7 @@ class Augmentation:
                 raise InputError(reason, path=field.name)
 
     def changed(self, item: TrainingItem, size: tuple[int, int] | None, key: Sequence[int]) -> TrainingItem:
-        """Change an item; the changes follow from the seed and `key`.
-
-        Args:
-            item: the item, with its mask.
-            size: (width, height) of the result; default: that of the item.
-            key: numbers from 0 on, such as that of the picture and how often it was changed.
-        """
+        """Change an item with its mask, to a size (width, height) px; changes follow from seed and numbers `key`."""
         rng = np.random.default_rng([self.seed, *key])
         item = mirrored(item) if rng.random() < self.flip else item
         at = self._placement(rng, item.size, item.size if size is None else size)

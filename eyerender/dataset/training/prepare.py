@@ -11,9 +11,8 @@ import numpy as np
 from ...base.errors import WRONG, InputError
 from ..draws import is_draw
 from .augment import Augmentation
-from .item import PARTS, PICTURES, PixelsOf, TrainingItem, part_of, pixels_of
+from .item import PARTS, PICTURES, PixelsOf, TrainingItem, mirrored_lamps, part_of, pixels_of
 from .place import Placement, mirrored, placed
-from .symmetry import mirrored_lamps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +65,9 @@ class Preparation:
         return self.flags or not set(self.parts) <= PICTURES.keys()
 
     def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:
-        """Read an item; left eyes are mirrored if asked for.
+        """Read an item from its line (`eyerender/image/5`; `where` in messages) and its pixels by kind of picture.
 
-        Args:
-            line: the line of metadata (`eyerender/image/5`).
-            picture: returns the pixels of a kind of picture; None where there are none.
-            where: names the line in messages.
+        Left eyes are mirrored if asked for.
 
         Raises:
             InputError: a picture or a label is missing or wrong.

@@ -51,12 +51,9 @@ WINDOWS = "Tuple((i8[::1], i8[:,::1], f8[:,::1], f8[::1]))"  # type for `compile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """Image properties that limit a fit of spots.
+    """Image properties that limit a fit of spots: a pixel's noise (standard deviation) and the level of clipping, DN.
 
-    Attributes:
-        noise_dn: standard deviation of a pixel's noise.
-        clip_dn: level at which the sensor clips.
-        slope_dn: prior standard deviation of the background's slope beyond B, DN per px.
+    `slope_dn` is the prior standard deviation of the background's slope beyond B, DN per px.
     """
 
     noise_dn: float
@@ -77,15 +74,9 @@ def fit_spots(
     height_dn: Floats,
     limits: Limits,
 ) -> SpotFit:
-    """Fit all spots of an image.
+    """Fit all spots of an image (DN), given their peaks (n, 2), estimated standard deviations (n,) and heights (n,).
 
-    Args:
-        linear: the image, DN.
-        known: returns the background B at pixels x and y, (k,) each.
-        start_px: (n, 2) detected peaks.
-        width_px: (n,) their estimated standard deviations.
-        height_dn: (n,) their heights.
-        limits: noise, clip level and the prior of the slope.
+    `known` returns the background B at pixels x and y, (k,) each.
     """
     middle, radius = np.rint(start_px), window_radius(width_px)
     first, offset, data = cut_windows(linear, start_px, middle, radius)
@@ -225,13 +216,9 @@ def _light_of_others(windows: Windows, s: int, theta: Floats, gone: Bools, noise
 
 @inlined
 def spot_slopes(windows: Windows, s: int, theta: Floats, rest: Floats) -> Floats:
-    """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of a spot; the last row is the residual.
+    """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of spot s; the last row is the residual.
 
-    Args:
-        windows: the windows.
-        s: the spot.
-        theta: (PARAMETERS,) its parameters.
-        rest: (k,) image minus B and the light of other spots in its pixels.
+    `theta` (PARAMETERS,) are its parameters; `rest` (k,) is the image minus B and the light of other spots.
     """
     first, offset, middle, radius = windows
     half, height, out = math.ceil(radius[s] + 0.5), math.exp(theta[2]), np.empty((PARAMETERS + 1, rest.size))

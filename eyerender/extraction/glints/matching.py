@@ -46,16 +46,10 @@ class Assignment:
 
 
 def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
-    """Compute the points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects both directions.
+    """Compute the points (l, 3) of a sphere that mirror lights (l, 3): the normal bisects both directions.
 
     The fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n contracts
     by about radius / distance.
-
-    Args:
-        centre_mm: (3,) centre of the sphere.
-        radius_mm: its radius.
-        camera_mm: (3,) nodal point of the camera.
-        lights_mm: (l, 3) lights.
     """
     centre, camera = np.asarray(centre_mm, dtype=np.float64), np.asarray(camera_mm, dtype=np.float64)
     lights = np.atleast_2d(np.asarray(lights_mm, dtype=np.float64))
@@ -207,14 +201,13 @@ def identify(
 
     Args:
         glints_px: (m, 2) glints.
-        pupil_px: see `predict_glints`, as are the next five.
+        pupil_px: as are the next five, see `predict_glints`.
         K: (3, 3).
         R: (3, 3).
         t_mm: (3,).
         lights_mm: (l, 3).
         eye_mm: (3,).
-        position_sd_mm: standard deviation of the cornea's position across the line of sight, given the pupil and
-            `eye_mm`.
+        position_sd_mm: standard deviation of the cornea's position across the line of sight, given pupil and `eye_mm`.
     """
     lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
     if lights.shape[0] == 0:

@@ -62,11 +62,7 @@ class Candidate:
 def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, levels: int = LEVELS) -> list[Candidate]:
     """Return up to `most` candidates, best first; none if nothing dark and round stands out.
 
-    Args:
-        prepared: the image.
-        shape: sizes and shapes to look for.
-        most: number of candidates.
-        levels: number of thresholds at evenly spaced grey levels.
+    They are blobs below thresholds at `levels` evenly spaced grey levels.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(min(max(shape.least_px // 3.5, 1), 4))

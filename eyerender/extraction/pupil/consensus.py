@@ -61,13 +61,9 @@ UNEVEN = 0.01
 
 
 def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected_noise_px: float) -> BoundaryFit | str:
-    """Fit the boundary of the pupil, or return the reason why there is none.
+    """Fit the boundary of the pupil to edge points around a dark blob, or return the reason why there is none.
 
-    Args:
-        edges: edge points around the candidate.
-        candidate: the dark blob.
-        shape: accepted sizes and shapes.
-        expected_noise_px: standard deviation of an edge point along its normal.
+    `expected_noise_px` is the standard deviation of an edge point along its normal.
     """
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
@@ -201,17 +197,11 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float,
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
-    """Select points and refit until the selection settles, in compiled code.
+    """Select points (n, 2) with normals (n, 2) and refit until the selection settles, in compiled code.
 
-    Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
-    2 inside the true edge.
-
-    Args:
-        points: (n, 2) edge points.
-        normals: (n, 2).
-        start: (5,) centre, semi-axes and angle.
-        sigma_px: width of the whole smoothing.
-        tolerance: largest distance of a selected point, px; twice that for the first selection.
+    Edge points are moved outward by the curvature shift: the steepest place of a blurred convex edge, with the whole
+    smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. Selected
+    points lie within `tolerance` px; twice that at first.
 
     Returns:
         The number of selected points (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points

@@ -96,14 +96,8 @@ class EdgeModel:
 class Profile(NamedTuple):
     """The blurred step and ramp across the boundary at one point.
 
-    Attributes:
-        edge: E, from 0 inside to 1 outside.
-        by_distance: its derivative by the distance.
-        by_sigma: its derivative by the standard deviation of the blur.
-        by_kurtosis: its derivative by the kurtosis of the blur.
-        ramp: R, the blurred max(d, 0).
-        ramp_by_distance: its derivative by the distance.
-        ramp_by_sigma: its derivative by the standard deviation of the blur.
+    E, from 0 inside to 1 outside, with its derivatives by the distance, by the standard deviation of the blur and by
+    its kurtosis; then R, the blurred max(d, 0), with the first two.
     """
 
     edge: float
@@ -194,14 +188,9 @@ def turn_harmonics(places: Floats, count: int, basis: Floats) -> None:
 
 @inlined
 def local_levels(places: Floats, count: int, numbers: Floats, basis: Floats, out: Floats) -> None:
-    """Write the levels at `count` places.
+    """Write the levels of the model (see `EdgeModel.numbers`) at `count` of the places (PLACES,) to `out` (LEVELS,).
 
-    Args:
-        places: (PLACES,) the places.
-        count: number of points.
-        numbers: (p,) the model (see `EdgeModel.numbers`).
-        basis: (2 BLOCK,) scratch memory.
-        out: (LEVELS,) the result.
+    `basis` (2 BLOCK,) is scratch memory.
     """
     outer, plane = numbers[11:], 1.0 / math.sqrt(numbers[2] * numbers[3])
     for i in range(count):

@@ -99,15 +99,7 @@ def around(centre: Floats, reach: float, shape: tuple[int, ...]) -> tuple[slice,
 
 
 def inpaint_glints(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: float, noise_dn: float) -> Inpainted:
-    """Replace glints near an ellipse by the level around them.
-
-    Args:
-        linear: the image, DN.
-        ellipse: the candidate.
-        inside_dn: level inside.
-        step_dn: step from inside to outside.
-        noise_dn: standard deviation of a pixel's noise.
-    """
+    """Replace glints near an ellipse by the level around them, given the level inside, the step and the noise."""
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse.centre_px, 1.4 * a + 8.0, linear.shape)
     crop = np.ascontiguousarray(linear[rows, columns])

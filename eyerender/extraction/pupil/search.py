@@ -55,13 +55,8 @@ def find_pupil(
 ) -> ScoredCandidate | PupilResult:
     """Return the most likely boundary of a dark or a bright pupil, or the reason why there is none.
 
-    If the middle of a dark pupil is bright, it may be an iris with a bright pupil.
-
-    Args:
-        prepared: the image.
-        shape: accepted sizes and shapes.
-        polarity: whether the pupil is darker or brighter than the iris; auto: the image decides.
-        prior: the pupil of the previous frame, which only decides where the search starts.
+    If the middle of a dark pupil is bright, it may be an iris with a bright pupil. `prior`, the pupil of the previous
+    frame, only decides where the search starts.
     """
     before = None if prior is None else prior.ellipse
     if polarity == "bright":

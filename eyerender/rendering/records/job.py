@@ -18,7 +18,7 @@ from ...eye.model import EyeModel
 from ...eye.worn import WornLens, choices
 from ...optics.media import TEARS
 from ...optics.surfaces import Surface
-from ...optics.surfaces_biconic import Biconic
+from ...optics.surfaces_graph import Biconic
 from ...optics.surfaces_measured import Measured
 from ...optics.surfaces_quadric import Quadric
 from ...optics.transforms import rotated
