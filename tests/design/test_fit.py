@@ -15,12 +15,23 @@ from eyerender.base.errors import FitWarning
 from eyerender.cli.main import run
 from eyerender.design.eyefile import changed_file
 from eyerender.design.features import MODEL_PX, measured, outline_distances, residuals
-from eyerender.design.fit import Options, equations_of, fit_eye, instants_of, problem_of, solve, weights_of
-from eyerender.design.information import arrow_inverse, case_of, eye_information, outline_normals
+from eyerender.design.fit import (
+    Options,
+    costs_of,
+    equations_of,
+    fit_eye,
+    instants_of,
+    marginal_step,
+    problem_of,
+    solve,
+    weights_of,
+)
+from eyerender.design.information import arrow_inverse, case_of, eye_information, outline_normals, roots_of
 from eyerender.design.noise import FeatureNoise
 from eyerender.design.unknowns import (
     CENTRE,
     COUNT,
+    DEPTH,
     ELLIPTICITY,
     GAP,
     KAPPA,
@@ -30,6 +41,7 @@ from eyerender.design.unknowns import (
     POSTERIOR,
     POSTERIOR_TORICITY,
     PUPIL,
+    RADIUS,
     SHIFT,
     TORICITY,
     Unknowns,
@@ -477,6 +489,55 @@ def test_an_eye_that_cannot_be_or_is_far_from_its_priors_is_refused(tmp_path, ca
     assert fit.chi2_per_degree > 2
     (calm,) = fit_eye(seen, frames.scene.rig, prior="E2")
     assert fit.known.axis_deg.mean() > 1.3 * calm.known.axis_deg.mean()
+
+
+def test_the_person_is_the_most_probable_one_with_frames_integrated_out():
+    """The step from the joint mode is Newton's on the marginal posterior, which quadrature gives (Gauss, Hermite)."""
+    frames = frames_of("head_mounted", most=4)
+    seen = er.trace(frames)
+    moved = replace(seen.index, eye_position_mm=seen.index.eye_position_mm + np.array([2.0, 1.0, -3.0]))
+    unknowns = Unknowns(gaze_deg="known", slippage_mm=3.0, corneal_radius_mm=0.5, pupil_depth_mm=0.5)
+    made = FeatureNoise.of(0.1, 0.05, rig=frames.scene.rig), Options(targets=False, robust="none")
+    problem = problem_of(replace(seen, index=moved), frames.scene.rig, frames.scene.eye_spec, unknowns, *made)
+    problem.centre[:, :2] = np.stack([seen.pose.azimuth_rad, seen.pose.elevation_rad], axis=1)
+    joint, _ = solve(problem, problem.centre)
+    nodes, shares = np.polynomial.hermite_e.hermegauss(3)
+    alone = replace(problem, free=problem.free & (np.arange(COUNT) < LOCAL))
+    local, person = np.flatnonzero(alone.free), [RADIUS, DEPTH]
+
+    def found(theta, features=images_of):
+        return residuals(problem.seen, features(problem.views, theta, 30))
+
+    def state(theta):
+        weights = weights_of(problem, found(theta))
+        return weights, equations_of(problem, theta, found(theta, slopes_of), weights)[0]
+
+    def marginal(shift):
+        """Half the negative logarithm of the posterior of the person."""
+        start = joint.copy()
+        start[:, person] += shift
+        best, _ = solve(alone, start)
+        weights, matrix = state(best)
+        root = roots_of(matrix[:, local[:, None], local] + np.diag(problem.precision[local]))
+        (least, prior), total = costs_of(problem, best, found(best), weights), np.zeros(len(best))
+        for which in np.ndindex(*(len(nodes),) * len(local)):
+            z, theta = nodes[list(which)], best.copy()
+            theta[:, local] += root @ z
+            cost = costs_of(problem, theta, found(theta), weights)[0]
+            total += np.prod(shares[list(which)]) * np.exp((least - cost + z @ z) / 2.0)
+        return (least.sum() + prior) / 2.0 - (np.log(total) + np.linalg.slogdet(root)[1]).sum()
+
+    matrix = state(joint)[1]
+    known = eye_information(
+        "right", (frames.index.fixation, frames.index.head), matrix, np.zeros((4, 2, COUNT)), unknowns
+    )
+    at, width = np.array(person) - LOCAL, 0.1
+    axes = np.linalg.cholesky(known.person_covariance[np.ix_(at, at)])
+    slope = [(marginal(width * axis) - marginal(-width * axis)) / (2.0 * width) for axis in axes.T]
+    wanted = -axes @ slope
+    step = marginal_step(problem, joint)[0, person]
+    assert (np.abs(step) > 0.05 * known.person_deviation[at]).all()
+    np.testing.assert_allclose(step, wanted, rtol=0.01)
 
 
 def test_a_frame_that_no_eye_explains_has_no_gaze():
