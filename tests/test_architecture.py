@@ -239,7 +239,7 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 98900,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 98950,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1210,  # eyes behind spectacles, and their reflections; Purkinje images of pictures, for trackers
     "apps": 17390,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 990,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
@@ -257,7 +257,7 @@ BOUNDS = {
     "region": 4110,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
     "rendering": 13110,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
     "report": 990,
-    "rig": 4640,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
+    "rig": 4670,  # arcs of light in barrels; fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
     "scene": 4360,  # people, times, lens reflections, Purkinje images in records; cameras past lenses; refusals
 }
 

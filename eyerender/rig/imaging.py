@@ -67,6 +67,12 @@ class Opening(Spec):
         default=4.0, description="standard deviation of the edge's blur (chosen)"
     )
     radiance_w_m2_sr: NonNegative = Field(default=0.0, description="radiance of the rim, within the camera's filter")
+    arcs_w_m2_sr: NonNegative = Field(
+        default=0.0,
+        description="radiance of the brightest arc on the rim beside that: edges of a lens and its mount, lit by "
+        "lamps, around a dark corner of the picture (shapes chosen)",
+    )
+    arcs_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the arcs")
 
 
 class Star(Spec):
