@@ -49,14 +49,15 @@ from eyerender.design.unknowns import (
 from eyerender.design.varied import images_of, lines_of_sight, radius_of, slopes_of
 from eyerender.gaze.estimate import angular_error_deg
 from eyerender.optics.transforms import direction_of
+from tests.support.paths import BARE_HEAD_MOUNTED
 
-RIGS = ("head_mounted", "guestrin2006", "blignaut2014")
+RIGS = (BARE_HEAD_MOUNTED, "guestrin2006", "blignaut2014")
 EYES = ("E1", "E2", "E3", "E4", "E5")
 
 
 def frames_of(name, eye="E2", most=9):
     scene = er.Scene.of(er.load_scene(name).spec, eye=eye)
-    if name == "head_mounted":
+    if name == BARE_HEAD_MOUNTED:
         scene = scene.with_(gaze_deg=[(azimuth, elevation) for elevation in (12, 0, -12) for azimuth in (15, 0, -15)])
     frames = scene.frames()
     rows = np.flatnonzero((frames.index.eye == frames.index.eye.min()) & (frames.index.head == 0))
@@ -242,7 +243,7 @@ def test_chi_square_of_fits_of_a_person_over_many_frames(rig):
 @pytest.mark.parametrize("what", ["glints", "outlines"])
 def test_wrong_features_hardly_matter(what):
     """10 % of the glints, or of the outlines, are wrong by many pixels: error at most 1.5 times as large."""
-    frames = frames_of("head_mounted")
+    frames = frames_of(BARE_HEAD_MOUNTED)
     frames = frames.take(np.tile(np.arange(9), 5))
     noise = FeatureNoise.of(0.07, 0.0085, rig=frames.scene.rig)
     rng = np.random.default_rng(8)
@@ -287,7 +288,7 @@ def test_distances_from_an_outline():
 
 def test_an_ellipse_with_a_covariance_weighs_as_it_says():
     """Whitened distances of a slightly other ellipse are those of its parameters, d^T C^-1 d with `MODEL_PX` in C."""
-    frames = frames_of("head_mounted", most=1)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=1)
     seen = er.trace(frames)
     rng = np.random.default_rng(2)
     root = rng.normal(size=(5, 5)) * 0.05
@@ -309,7 +310,7 @@ def test_an_ellipse_with_a_covariance_weighs_as_it_says():
 @pytest.mark.parametrize("off", [0.08, 5.0])
 def test_outlines_that_are_off_by_more_than_their_noise_count_and_wrong_ones_do_not(off):
     """As an extractor gives them: a noise of .008 px is stated, and every fourth outline is longer and narrower."""
-    frames = frames_of("head_mounted")
+    frames = frames_of(BARE_HEAD_MOUNTED)
     seen = er.trace(frames)
     longer = np.arange(len(seen)) % 4 == 1
     bent = replace(
@@ -347,7 +348,7 @@ def test_centres_of_pupils_alone_give_the_gaze_too(rig):
 
 def test_the_eye_file_is_the_eye_that_was_fitted():
     """A file with changed numbers, built, has the features and the line of sight of the unknowns that made it."""
-    frames = frames_of("head_mounted", most=3)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=3)
     case, _ = case_of(frames)
     theta = case.theta.copy()
     theta[:, 6:12] = [0.2, 0.04, 0.1, np.radians(1.5), np.radians(-1.0), 0.3]
@@ -568,7 +569,7 @@ def test_a_calibration_finds_kappa():
 
 
 def test_instants_join_cameras_but_not_repeats():
-    frames = frames_of("head_mounted", most=2)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=2)
     seen = er.trace(frames.take([0, 1, 0, 1]))
     assert sorted(instants_of(seen).tolist()) == [0, 1, 2, 3]
     both = replace(seen, index=replace(seen.index, camera=np.array([0, 0, 1, 1])))
@@ -618,7 +619,7 @@ def test_what_is_kept_of_many_instants_grows_with_their_number():
 
 
 def test_what_cannot_be_fitted_is_named():
-    frames = frames_of("head_mounted", most=2)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=2)
     seen = er.trace(frames)
     lost = replace(seen, index=replace(seen.index, eye_position_mm=np.full((2, 3), np.nan)))
     with pytest.raises(er.InputError, match="eye_position_mm: is needed, at least roughly"):
