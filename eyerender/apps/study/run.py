@@ -34,6 +34,7 @@ STUDIES: Final = MappingProxyType(
         "observers": "head_mounted:ObserversStudy",
         "conditions": "conditions_study:ConditionsStudy",
         "rigs": "rigs:RigsStudy",
+        "glasses": "glasses_study:GlassesStudy",
     }
 )
 """Name of a study -> its class in this package."""
@@ -60,8 +61,8 @@ def run_study(
     >>> er.apps.run_study("conditions", "out/conditions", eyes=["E2"])  # doctest: +SKIP
 
     Args:
-        study: guestrin2006, blignaut2014, observers, conditions or rigs; or your own: a subclass of `Study`, or its
-            name as `module:Class`.
+        study: guestrin2006, blignaut2014, observers, conditions, rigs or glasses; or your own: a subclass of `Study`,
+            or its name as `module:Class`.
         folder: the folder for the results.
         options: protocol, observer, workers and the like.
         eyes: eye models (catalogue names or files; default: those of the study, or none if people are asked for).
@@ -146,7 +147,7 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
     if observer not in study.observers:
         known = " or ".join(map(repr, study.observers))
         raise InputError(f"the study {name!r} needs {known}, not {observer!r}", source="--observer")
-    if count and observer != "analytic":
+    if count and observer != "analytic" and not study.images_of_people:
         raise InputError("people are observed by ray optics only", source="--observer")
     preset = Population(options.population or study.population or "adults").preset
     protocols = (options.protocol,) if options.protocol in study.protocols else tuple(study.protocols)
@@ -192,7 +193,7 @@ def _with_images(
 ) -> StudyPlan:
     """Make the images that a plan needs, and give them to its observers."""
     kinds = [one.kind for one in plan.observings]
-    if kinds == ["analytic"]:
+    if kinds == ["analytic"] or not plan.eyes:
         return plan
     scenes = []
     for eye in plan.eyes:

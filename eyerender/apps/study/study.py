@@ -107,6 +107,7 @@ class Study:
         people: number of people of a run without `--people`; 0 for eye models.
         population: preset from which people are drawn; None if the study draws none.
         observers: observers that can be chosen; the first is the default.
+        images_of_people: whether `part` renders images of people itself; otherwise people are observed by rays only.
         protocols: names of the readings of a paper.
         facing: whether cameras are turned to the eyes for images.
         shown: names of the estimators in figures of the error budget and of the observers; empty for all.
@@ -125,6 +126,7 @@ class Study:
     people: ClassVar[int] = 0
     population: ClassVar[str | None] = "adults"
     observers: ClassVar[Sequence[str]] = ("analytic", "image", "both")
+    images_of_people: ClassVar[bool] = False
     protocols: ClassVar[Sequence[str]] = ("own",)
     facing: ClassVar[bool] = False
     shown: ClassVar[Sequence[str]] = ()
