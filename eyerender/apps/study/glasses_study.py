@@ -95,7 +95,6 @@ class GlassesStudy(Study):
     eyes = ()
     people = 24
     observers = ("analytic", "image", "both")
-    images_of_people = True
 
     def jobs(self, plan: StudyPlan) -> list[StudyJob]:
         """Leave out images without noise."""

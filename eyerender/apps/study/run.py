@@ -35,6 +35,7 @@ STUDIES: Final = MappingProxyType(
         "conditions": "conditions_study:ConditionsStudy",
         "rigs": "rigs:RigsStudy",
         "glasses": "glasses_study:GlassesStudy",
+        "pupil-size": "pupil_size:PupilSizeStudy",
     }
 )
 """Name of a study -> its class in this package."""
@@ -147,8 +148,8 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
     if observer not in study.observers:
         known = " or ".join(map(repr, study.observers))
         raise InputError(f"the study {name!r} needs {known}, not {observer!r}", source="--observer")
-    if count and observer != "analytic" and not study.images_of_people:
-        raise InputError("people are observed by ray optics only", source="--observer")
+    if options.image_people is not None and not (count and observer != "analytic"):
+        raise InputError("needs people and an observer of images", source="--image-people")
     preset = Population(options.population or study.population or "adults").preset
     protocols = (options.protocol,) if options.protocol in study.protocols else tuple(study.protocols)
     return StudyPlan(
@@ -157,7 +158,10 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
         people=tuple({"preset": preset, "seed": PEOPLE_SEED, "subject": k} for k in range(count)),
         protocols=protocols,
         observer=observer,
-        observings=tuple(Observing(kind) for kind in _kinds(observer, options.noise)),
+        observings=tuple(
+            Observing(kind, spp=options.spp, backend=options.backend, threads=options.threads)
+            for kind in _kinds(observer, options.noise)
+        ),
     )
 
 
