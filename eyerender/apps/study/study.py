@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -55,7 +56,10 @@ _PUPIL_MM = 4.0  # diameter of a person's pupil where the scene states none
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyPlan:
-    """What a run of a study observes; `people` are choices of a population (preset, seed, subject)."""
+    """What a run of a study observes; `people` are choices of a population (preset, seed, subject).
+
+    `folder` is for the pictures of the run.
+    """
 
     options: StudyOptions
     eyes: tuple[str, ...]
@@ -63,6 +67,7 @@ class StudyPlan:
     protocols: tuple[str, ...]
     observer: str
     observings: tuple[Observing, ...]
+    folder: Path = Path()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
