@@ -46,7 +46,7 @@ def test_everything_is_drawn_and_labelled():
     targeted = setup.following(2)
     again = strokes(targeted.frames(), er.trace(targeted.frames()), row)
     assert "target" in [label.text for label in again.labels]
-    middle, radius = extent_mm(found, setup.apex_mm)
+    middle, radius = extent_mm(found, setup.apex_mm, setup.scene.rig)
     assert np.linalg.norm(found.ends_mm.reshape(-1, 3) - middle, axis=1).max() <= radius
     np.testing.assert_allclose(colours_of([ANALYTIC])[0] * 255, np.array([0, 0x72, 0xB2]))
 
