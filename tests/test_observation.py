@@ -12,14 +12,7 @@ import pytest
 
 from eyerender.base.errors import InputError
 from eyerender.base.status import Status
-from eyerender.scene.observation import (
-    GlintFeatures,
-    Index,
-    Observations,
-    PoseTruth,
-    PupilFeatures,
-    concatenate,
-)
+from eyerender.scene.observation import GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 
 
 def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) -> Observations:
@@ -68,12 +61,7 @@ def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) ->
             covariance=cov,
         ),
         glints=GlintFeatures(
-            status=g_status,
-            light=light,
-            reason=g_reason,
-            in_image=g_status == Status.OK,
-            xy_px=xy,
-            covariance=g_cov,
+            status=g_status, light=light, reason=g_reason, in_image=g_status == Status.OK, xy_px=xy, covariance=g_cov
         ),
     )
 

@@ -35,37 +35,21 @@ RigidMotions = tuple[Floats, Floats]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Features(ArrayValue):
-    """Features of n eyes in their cameras; pixels are full-sensor, NaN where the status is not OK.
+    """Features of n eyes in their cameras; pixels are full-sensor, NaN where the status is not OK."""
 
-    Attributes:
-        points_px: (n, k, 2) the pupil's boundary.
-        point_status: (n, k).
-        point_residual_mm: (n, k).
-        centre_px: (n, 2) centre of its direct least-squares ellipse.
-        semi_axes_px: (n, 2).
-        angle_rad: (n,).
-        ellipse_residual_px: (n,) deviation (rms) of the boundary from the ellipse.
-        anatomical_centre_px: (n, 2) image of the stop's centre.
-        point_in_image: (n, k).
-        glints_px: (n, m, p, 2) the p requested Purkinje images of each of m lights; the first one is the glint.
-        glint_status: (n, m, p).
-        glint_residual_mm: (n, m, p).
-        glint_in_image: (n, m, p).
-    """
-
-    points_px: Floats
-    point_status: Statuses
-    point_residual_mm: Floats
-    centre_px: Floats
-    semi_axes_px: Floats
-    angle_rad: Floats
-    ellipse_residual_px: Floats
-    anatomical_centre_px: Floats
-    point_in_image: Bools
-    glints_px: Floats
-    glint_status: Statuses
-    glint_residual_mm: Floats
-    glint_in_image: Bools
+    points_px: Floats  # (n, k, 2) the pupil's boundary
+    point_status: Statuses  # (n, k)
+    point_residual_mm: Floats  # (n, k)
+    centre_px: Floats  # (n, 2) centre of its direct least-squares ellipse
+    semi_axes_px: Floats  # (n, 2)
+    angle_rad: Floats  # (n,)
+    ellipse_residual_px: Floats  # (n,) deviation (rms) of the boundary from the ellipse
+    anatomical_centre_px: Floats  # (n, 2) image of the stop's centre
+    point_in_image: Bools  # (n, k)
+    glints_px: Floats  # (n, m, p, 2) the p requested Purkinje images of each of m lights; the first one is the glint
+    glint_status: Statuses  # (n, m, p)
+    glint_residual_mm: Floats  # (n, m, p)
+    glint_in_image: Bools  # (n, m, p)
 
     @property
     def pupil_status(self) -> Statuses:

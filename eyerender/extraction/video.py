@@ -67,18 +67,12 @@ class Track:
 
     In a blink or a wink something else may look like the pupil: a screw, a brow, the other eye. It is followed only
     after it has been there for as long as the pupil before, or for LONGEST_S.
-
-    Attributes:
-        pupil: the followed pupil where it was last; None before the first.
-        span_s: first and last time at which it was seen.
-        other: the pupil elsewhere.
-        other_s: first time at which it was seen.
     """
 
-    pupil: PupilResult | None = None
-    span_s: tuple[float, float] = (0.0, 0.0)
-    other: PupilResult | None = None
-    other_s: float = 0.0
+    pupil: PupilResult | None = None  # the followed pupil where it was last; None before the first
+    span_s: tuple[float, float] = (0.0, 0.0)  # first and last time at which it was seen
+    other: PupilResult | None = None  # the pupil elsewhere
+    other_s: float = 0.0  # first time at which it was seen
 
     def follow(self, found: Extraction, time_s: float) -> Extraction:
         """Take the result of the next frame, and return it, without the pupil and glints if they are elsewhere."""

@@ -42,23 +42,16 @@ class PurkinjePoints(ArrayValue):
     """Points at which a surface inside the eye reflects light from a source to a viewpoint.
 
     Values are NaN if there is no such ray.
-
-    Attributes:
-        points_mm: (..., 3) mirror point on the reflecting surface.
-        exit_points_mm: (..., 3) where the ray meets the outermost surface on its way to the viewpoint.
-        directions: (..., 3) unit vectors from there to the viewpoint.
-        course_mm: (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point to
-            the point of entry.
-        residual_mm: (...,) miss distance of the ray.
-        status: (...,).
     """
 
-    points_mm: Floats
-    exit_points_mm: Floats
-    directions: Floats
+    points_mm: Floats  # (..., 3) mirror point on the reflecting surface
+    exit_points_mm: Floats  # (..., 3) where the ray meets the outermost surface on its way to the viewpoint
+    directions: Floats  # (..., 3) unit vectors from there to the viewpoint
+    # (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point to the point of
+    # entry
     course_mm: Floats
-    residual_mm: Floats
-    status: Statuses
+    residual_mm: Floats  # (...,) miss distance of the ray
+    status: Statuses  # (...,)
 
 
 def purkinje_path(

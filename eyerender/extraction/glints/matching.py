@@ -28,21 +28,13 @@ ROTATION_TO_CORNEA_MM = 5.7
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Assignment:
-    """The light of each glint.
+    """The light of each glint."""
 
-    Attributes:
-        light: (m,) index of every glint's light, -1 for none.
-        reasons: why a glint has no light; None if it has one.
-        residual_px: (m,) distance from the expected position after shift and scale; 0 without a light.
-        shift_px: (2,) shift of the layout that fitted.
-        scale: scale of the layout that fitted.
-    """
-
-    light: Indices
-    reasons: tuple[str | None, ...]
-    residual_px: Floats
-    shift_px: Floats
-    scale: float
+    light: Indices  # (m,) index of every glint's light, -1 for none
+    reasons: tuple[str | None, ...]  # why a glint has no light; None if it has one
+    residual_px: Floats  # (m,) distance from the expected position after shift and scale; 0 without a light
+    shift_px: Floats  # (2,) shift of the layout that fitted
+    scale: float  # scale of the layout that fitted
 
 
 def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
@@ -221,22 +213,14 @@ class _Search:
     """Search for a layout: the glints (m, 2) and lights (l, 2) to match, px, and what is plausible.
 
     A layout places the lights at middle + shift + scale (lights - middle).
-
-    Attributes:
-        glints: the glints.
-        lights: expected glints of the lights.
-        middle: (2,) middle of the lights.
-        reach: (l,) largest distance of a glint from its light.
-        scale_range: limits of the scale.
-        shift_sd: standard deviation of the shift.
     """
 
-    glints: Floats
-    lights: Floats
-    middle: Floats
-    reach: Floats
-    scale_range: tuple[float, float]
-    shift_sd: float
+    glints: Floats  # the glints
+    lights: Floats  # expected glints of the lights
+    middle: Floats  # (2,) middle of the lights
+    reach: Floats  # (l,) largest distance of a glint from its light
+    scale_range: tuple[float, float]  # limits of the scale
+    shift_sd: float  # standard deviation of the shift
 
     def promising(self) -> list[tuple[Floats, float]]:
         """Return the (shift, scale) pairs for which a one-to-one match is worth trying.
