@@ -73,39 +73,26 @@ class Features(ArrayValue):
 
 
 def features(
-    eyes: Sequence[EyeModel],
-    eye_index: npt.ArrayLike,
-    poses: Poses,
-    position_mm: npt.ArrayLike,
-    cameras: Sequence[PinholeCamera],
-    camera_index: npt.ArrayLike,
-    lights_mm: npt.ArrayLike,
+    eyes: Sequence[EyeModel],  # distinct eyes
+    eye_index: npt.ArrayLike,  # (n,) the eye of each row
+    poses: Poses,  # n poses
+    position_mm: npt.ArrayLike,  # (n, 3) unrotated apex in the world, including the head's displacement
+    cameras: Sequence[PinholeCamera],  # distinct cameras
+    camera_index: npt.ArrayLike,  # (n,) the camera of each row
+    lights_mm: npt.ArrayLike,  # (m, 3) in the world
     *,
-    lit: npt.ArrayLike = True,
-    boundary_points: int = 30,
+    lit: npt.ArrayLike = True,  # (n, m) whether a light lights the eye; if not, its images have status NONE
+    boundary_points: int = 30,  # number of boundary points, >= 6
+    # orders of the requested images of each light; one that an eye lacks has status MISSED
     purkinje: Sequence[int] = (1,),
+    # what hides features besides the eye itself. Light that enters the eye is followed from its lamp to the point where
+    # it leaves.
     occluders: Occluders | None = None,
-    stops: Stop | None = None,
+    stops: Stop | None = None,  # n stops in place of those of the eyes
+    # n rotations and translations x' = R x + t that move cameras, lights and occluders in the world
     rig_motion: RigidMotions | None = None,
 ) -> Features:
-    """Compute the features of n eyes.
-
-    Args:
-        eyes: distinct eyes.
-        eye_index: (n,) the eye of each row.
-        poses: n poses.
-        position_mm: (n, 3) unrotated apex in the world, including the head's displacement.
-        cameras: distinct cameras.
-        camera_index: (n,) the camera of each row.
-        lights_mm: (m, 3) in the world.
-        lit: (n, m) whether a light lights the eye; if not, its images have status NONE.
-        boundary_points: number of boundary points, >= 6.
-        purkinje: orders of the requested images of each light; one that an eye lacks has status MISSED.
-        occluders: what hides features besides the eye itself. Light that enters the eye is followed from its lamp to
-            the point where it leaves.
-        stops: n stops in place of those of the eyes.
-        rig_motion: n rotations and translations x' = R x + t that move cameras, lights and occluders in the world.
-    """
+    """Compute the features of n eyes."""
     _check_options(len(np.atleast_1d(eye_index)), boundary_points, purkinje)
     which = np.asarray(eye_index, dtype=np.intp)
     cams = np.asarray(camera_index, dtype=np.intp)

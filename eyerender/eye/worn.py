@@ -143,21 +143,13 @@ class Course:
     @classmethod
     def of(
         cls,
-        lenses: Sequence[WornLens],
-        before: Choice,
-        middle: Sequence[Crossing],
-        after: Choice = (),
-        own: int | None = None,
+        lenses: Sequence[WornLens],  # all worn lenses, in order from the eye
+        before: Choice,  # those passed on the way from the viewpoint, in the order in which they are passed
+        middle: Sequence[Crossing],  # the crossings of the eye, or those of lens `own` if that is given
+        after: Choice = (),  # those passed on the way to the target, in the order in which they are passed
+        own: int | None = None,  # number of a lens that reflects the ray
     ) -> Course:
-        """Join what the lenses before and after do to the crossings in the middle.
-
-        Args:
-            lenses: all worn lenses, in order from the eye.
-            before: those passed on the way from the viewpoint, in the order in which they are passed.
-            middle: the crossings of the eye, or those of lens `own` if that is given.
-            after: those passed on the way to the target, in the order in which they are passed.
-            own: number of a lens that reflects the ray.
-        """
+        """Join what the lenses before and after do to the crossings in the middle."""
         inwards = own is None or all(k > own for k in (*before, *after))
         steps = [(c, k) for k in before for c in (lenses[k].inward() if inwards else lenses[k].outward())]
         back = [(c, k) for k in after for c in (lenses[k].outward() if inwards else lenses[k].inward())]

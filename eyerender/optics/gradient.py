@@ -89,25 +89,15 @@ class GradientMedium(ArrayValue):
 
     def cross(
         self,
-        surface: Surface,
-        inward: bool,
-        point: Xyz,
-        way: Xyz,
-        moves: Sequence[Xyz] = (),
-        turns: Sequence[Xyz] = (),
-        steps: int | None = None,
+        surface: Surface,  # the surface through which the rays leave
+        inward: bool,  # whether the rays go from the front to the back
+        point: Xyz,  # start points of the rays
+        way: Xyz,  # directions of the rays behind the first surface
+        moves: Sequence[Xyz] = (),  # differentials of `point` (along the surface) to propagate
+        turns: Sequence[Xyz] = (),  # differentials of `way` to propagate
+        steps: int | None = None,  # steps in each half; None: STEPS
     ) -> Passage:
-        """Trace rays between the surfaces of the medium; `hit.ok` is False for one that leaves where it entered.
-
-        Args:
-            surface: the surface through which the rays leave.
-            inward: whether the rays go from the front to the back.
-            point: start points of the rays.
-            way: directions of the rays behind the first surface.
-            moves: differentials of `point` (along the surface) to propagate.
-            turns: differentials of `way` to propagate.
-            steps: steps in each half; None: STEPS.
-        """
+        """Trace rays between the surfaces of the medium; `hit.ok` is False for one that leaves where it entered."""
         steps = STEPS if steps is None else steps
         place, speed = _stacked(point, way)
         ndim = place.ndim - 1

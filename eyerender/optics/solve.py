@@ -52,24 +52,15 @@ class Rays(NamedTuple):
 
 
 def apparent_points(
-    surfaces: Sequence[Surface],
-    indices: Sequence[FloatLike],
-    object_points_mm: npt.ArrayLike,
-    viewpoint_mm: npt.ArrayLike,
+    surfaces: Sequence[Surface],  # outside in
+    indices: Sequence[FloatLike],  # the index behind each surface
+    object_points_mm: npt.ArrayLike,  # (..., 3) points behind the surfaces
+    viewpoint_mm: npt.ArrayLike,  # (..., 3) viewpoints; they broadcast against the object points
     *,
-    rim_mm: FloatLike = np.inf,
-    n_outside: float = 1.0,
+    rim_mm: FloatLike = np.inf,  # rim radius of the outermost surface (the limbus)
+    n_outside: float = 1.0,  # index outside the eye
 ) -> ApparentPoints:
-    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction).
-
-    Args:
-        surfaces: outside in.
-        indices: the index behind each surface.
-        object_points_mm: (..., 3) points behind the surfaces.
-        viewpoint_mm: (..., 3) viewpoints; they broadcast against the object points.
-        rim_mm: rim radius of the outermost surface (the limbus).
-        n_outside: index outside the eye.
-    """
+    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction)."""
     rays = refracted_rays(
         surfaces, indices, components(object_points_mm), components(viewpoint_mm), rim_mm=rim_mm, n_outside=n_outside
     )
