@@ -10,18 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from eyerender.analytic.observer import trace
 from eyerender.apps.inspection import inspect
 from eyerender.base.errors import InputError, UnfinishedRunWarning
 from eyerender.cli.main import run
 from eyerender.dataset.export import export
 from eyerender.dataset.spec import shipped_datasets
 from eyerender.dataset.validate import validate
-from eyerender.dataset.validation.truth import SceneTruth
 from eyerender.folders.imagefile import picture_bytes, read_image, write_png
 from eyerender.folders.imagefolder import ImageFolder
-from eyerender.imaging.labels import EyeInWindow, known_labels
-from eyerender.imaging.lines import image_line
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping
 from tests.support.in_process import single_workers_in_process
@@ -177,22 +173,6 @@ def test_what_is_no_dataset_is_refused(copy, tmp_path):
         validate(copy)
     with pytest.raises(InputError, match="no such folder"):
         validate(tmp_path / "nowhere")
-
-
-def test_lines_of_a_rendered_folder_are_computed_again():
-    scene = load_scene("guestrin2006")
-    observed = trace(scene)
-    truth = SceneTruth(scene.frames(), observed)
-    view = EyeInWindow.of(scene.frames(), 0)
-    (record,) = observed.take([0]).records()
-    labels = known_labels(scene, observed, view)
-    labels["glints"] = [{**glint, "spot_xy_px": None, "hidden_by": "visible"} for glint in labels["glints"]]
-    line = image_line(scene, record, view.window, {**labels, "lid_margins_px": None})
-    assert truth.again(line).problems == ()
-    line["records"][0]["pupil"]["points_px"][3][0] += 0.01
-    assert any("points_px" in problem for problem in truth.again(line).problems)
-    line["labels"]["space"]["world"]["cornea_centre_mm"][0] += 0.01
-    assert any("cornea_centre_mm" in problem for problem in truth.again(line).problems)
 
 
 def written(path, name):
