@@ -244,20 +244,20 @@ BOUNDS = {
     "apps": 17210,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 970,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2660,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
-    "cli": 2700,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 11870,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
+    "cli": 2660,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
+    "dataset": 11770,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3970,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
-    "extraction": 6270,
-    "eye": 4540,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
+    "extraction": 6030,
+    "eye": 4450,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1840,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
-    "gaze": 5350,  # tables of other trackers; intervals of budgets; precision, for laboratories
+    "gaze": 5310,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 3480,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
-    "optics": 5290,
-    "population": 2570,  # children who become more myopic as they grow, for trackers of children
+    "optics": 5070,
+    "population": 2500,  # children who become more myopic as they grow, for trackers of children
     "region": 4110,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
     "rendering": 13110,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
-    "report": 990,
-    "rig": 4570,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
+    "report": 970,
+    "rig": 4540,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
     "scene": 4330,  # people, times and lens reflections in records; cameras past lenses; refusals where written
     "torch": 820,  # a small network for gaze, which an example and a study share, for trainers
 }

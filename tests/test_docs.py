@@ -1,7 +1,8 @@
-"""The documentation site: its references are complete, its pages are reachable, and their links resolve."""
+"""The documentation site, the examples of docstrings and of the page on Python, and the stored data."""
 
 from __future__ import annotations
 
+import doctest
 import importlib.util
 import json
 import os
@@ -11,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ import eyerender as er
 from docs.tools import keys, references, validation
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
-from tests.support.paths import ROOT
+from tests.support.paths import DATA, ROOT
 
 DOCS = ROOT / "docs"
 GALLERY = "gallery/index"  # made by sphinx-gallery
@@ -214,3 +215,75 @@ def test_a_drawing_of_the_pages_is_the_one_of_today(makers, name, tmp_path):
     )
     assert mine.shape == told.shape
     assert np.mean(np.abs(mine - told) > 64) < 1e-3  # fonts may differ by a little
+
+
+ROWS = [line for line in (DATA / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+
+
+def test_every_file_is_listed_once():
+    listed = [name for row in ROWS for name in re.findall(r"`([^`]+)`", row.split("|")[1])]
+    assert sorted(listed) == sorted(p.name for p in DATA.iterdir() if p.name != "README.md")
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: re.findall(r"`([^`]+)`", row)[0])
+def test_a_row_names_the_program_how_it_was_used_and_its_licence(row):
+    _, _, program, how, licence, _ = row.split("|")
+    assert all(cell.strip() for cell in (program, how, licence))
+
+
+SPACES = [getattr(er, name) for name in er.__all__ if isinstance(getattr(er, name), ModuleType)]
+FOUND = {name: getattr(er, name) for name in er.__all__ if name != "__version__"} | {
+    f"{space.__name__}.{name}": getattr(space, name) for space in SPACES for name in space.__all__
+}
+EXAMPLES = {name: one for name, one in FOUND.items() if ">>>" in (one.__doc__ or "")}
+
+
+def test_every_name_at_the_root_has_an_example():
+    assert [name for name in er.__all__ if name not in EXAMPLES and name in FOUND and FOUND[name] not in SPACES] == []
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_example_prints_what_it_says(name):
+    wanted = doctest.DocTestParser().get_doctest(EXAMPLES[name].__doc__, {"er": er, "np": np}, name, None, None)
+    output: list[str] = []
+    assert doctest.DocTestRunner().run(wanted, out=output.append).failed == 0, "".join(output)
+
+
+PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+
+
+def blocks():
+    return re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_every_name_on_the_page_exists():
+    names = set(re.findall(r"\ber\.((?:gaze\.)?\w+)", PAGE)) - {"gaze"}
+    assert len(names) > 20
+    for name in names:
+        found = er
+        for part in name.split("."):
+            found = getattr(found, part)
+    for name in re.findall(r"^\| `(\w+)\(", PAGE, re.MULTILINE):
+        assert hasattr(er.gaze, name)
+
+
+def test_the_example_of_statuses_runs(capsys):
+    (block,) = [block for block in blocks() if "er.Status" in block]
+    exec(block, {"er": er, "np": np})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "270 of 270 pupils"
+    assert lines[2:] == ["<Status.OK: 0> None"]
+
+
+def test_the_examples_of_gaze_run(capsys):
+    space: dict[str, Any] = {"er": er}
+    for block in blocks():
+        if "leave_one_target_out" in block or "class Middle" in block:
+            exec(block, space)
+    mean, largest = map(float, capsys.readouterr().out.split())
+    assert 0 < mean < largest < 5
+    middle = space["Middle"]().fit(space["truth"], space["scene"].rig)
+    again = type(middle).from_mapping(middle.to_mapping())
+    gaze = again.predict(space["truth"], space["scene"].rig)
+    assert gaze.ok.all()
+    assert gaze == middle.predict(space["truth"], space["scene"].rig)

@@ -69,12 +69,7 @@ def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) ->
             covariance=cov,
         ),
         glints=GlintFeatures(
-            status=g_status,
-            light=light,
-            reason=g_reason,
-            in_image=g_status == Status.OK,
-            xy_px=xy,
-            covariance=g_cov,
+            status=g_status, light=light, reason=g_reason, in_image=g_status == Status.OK, xy_px=xy, covariance=g_cov
         ),
     )
 

@@ -84,21 +84,13 @@ _LOCK = threading.Lock()  # lock of `ensure_compiled`
 
 
 class Program(NamedTuple):
-    """Functions that are compiled together.
+    """Functions that are compiled together."""
 
-    Attributes:
-        title: its name in messages.
-        about_s: compilation time on two cores in seconds, for the message.
-        packages: packages of its modules.
-        module: module that imports them all; run as a script, it compiles a share of them.
-        complete: file in FOLDER whose existence means that all functions are compiled.
-    """
-
-    title: str
-    about_s: int
-    packages: tuple[str, ...]
-    module: str
-    complete: str
+    title: str  # its name in messages
+    about_s: int  # compilation time on two cores in seconds, for the message
+    packages: tuple[str, ...]  # packages of its modules
+    module: str  # module that imports them all; run as a script, it compiles a share of them
+    complete: str  # file in FOLDER whose existence means that all functions are compiled
 
 
 EXTRACTOR = Program("the extractor", ABOUT_S, ("eyerender.extraction",), "eyerender.extraction.compile", "complete")

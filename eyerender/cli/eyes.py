@@ -40,13 +40,7 @@ def eyes(name: str | None = None, /, *, json: Result = None) -> int:
 
 @app.command(name="view")
 def view(
-    what: Literal["eye", "scene"],
-    name: str,
-    /,
-    *,
-    output: OutputFile,
-    eye: str | None = None,
-    strict: Strict = False,
+    what: Literal["eye", "scene"], name: str, /, *, output: OutputFile, eye: str | None = None, strict: Strict = False
 ) -> int:
     """Draw an eye's section, or a scene's rig and rays, as SVG, PDF or PNG.
 

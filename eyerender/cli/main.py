@@ -20,7 +20,6 @@ from . import (  # noqa: F401
     benchmark,
     dataset,
     environment,
-    export,
     eyes,
     gaze,
     images,
@@ -28,10 +27,8 @@ from . import (  # noqa: F401
     live,
     observe,
     population,
-    realism,
     rig,
     study,
-    sweep,
 )
 from .app import app, option_name
 from .examples import add_examples

@@ -66,10 +66,9 @@ def croissant(plan: Plan, sums: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _file(name: str, sha256: str) -> dict[str, Any]:
-    words, encoding = {
-        METADATA: (_LINES, "application/jsonlines"),
-        INDEX: (_INDEX, "application/octet-stream"),
-    }.get(name, ("The pictures of a shard.", "application/x-tar"))
+    words, encoding = {METADATA: (_LINES, "application/jsonlines"), INDEX: (_INDEX, "application/octet-stream")}.get(
+        name, ("The pictures of a shard.", "application/x-tar")
+    )
     own = {"@type": "cr:FileObject", "@id": name, "name": name, "description": words, "contentUrl": name}
     return {**own, "encodingFormat": encoding, "sha256": sha256}
 

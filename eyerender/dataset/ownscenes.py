@@ -52,19 +52,13 @@ class GivenScene:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnScenes:
-    """Where the scenes of a plan come from, if not from its spec.
+    """Where the scenes of a plan come from, if not from its spec."""
 
-    Attributes:
-        reference: `module:function`; empty where the scenes are handed over one by one (`DatasetWriter`).
-        sha256: SHA-256 of the module's file; empty where it has none.
-        frames: frames of each scene that is handed over; 0 for a function.
-        function: takes (seed, sample) and what it names of `MORE`, and returns a scene or (scene, draws); None where it
-            is not loaded.
-    """
-
-    reference: str
-    sha256: str = ""
-    frames: int = 0
+    reference: str  # `module:function`; empty where the scenes are handed over one by one (`DatasetWriter`)
+    sha256: str = ""  # SHA-256 of the module's file; empty where it has none
+    frames: int = 0  # frames of each scene that is handed over; 0 for a function
+    # takes (seed, sample) and what it names of `MORE`, and returns a scene or (scene, draws); None where it is not
+    # loaded
     function: Callable[..., Any] | None = field(default=None, compare=False)
 
     @classmethod

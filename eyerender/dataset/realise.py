@@ -253,11 +253,7 @@ def sample_line(
             "sequence_index": turn.sequence,
             "timestamp_s": finite_or_none(observations.index.timestamp_s[row]),
         },
-        drawn={
-            "attempt": turn.attempt,
-            "subject_attempt": turn.subject_attempt,
-            "draws": sample.draws,
-        },
+        drawn={"attempt": turn.attempt, "subject_attempt": turn.subject_attempt, "draws": sample.draws},
         tree={**sample.scene, "sensor": {**sample.scene.get("sensor", {}), **exposed}},
         eye=sample.eye or None,
     )

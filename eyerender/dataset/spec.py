@@ -42,8 +42,7 @@ class LabelsSpec(Spec):
     )
     amodal_masks: bool = Field(default=False, description="also write masks of the eye without anything in front of it")
     as_annotated: bool = Field(
-        default=False,
-        description="also write masks as people draw them: lids cut the eye, lashes and glints do not",
+        default=False, description="also write masks as people draw them: lids cut the eye, lashes and glints do not"
     )
     noiseless: bool = Field(
         default=False, description="also write each image without sensor noise, from the same rendering"
@@ -76,12 +75,7 @@ class LabelsSpec(Spec):
     def pictures(self) -> tuple[str, ...]:
         """Kinds of images that every sample has; each kind has its own folder."""
         more = ("amodal_masks", "as_annotated", "noiseless", "highlights", "lens_reflections")
-        return (
-            "images",
-            "masks",
-            *(kind for kind in more if getattr(self, kind)),
-            *sorted(set(self.geometry or ())),
-        )
+        return ("images", "masks", *(kind for kind in more if getattr(self, kind)), *sorted(set(self.geometry or ())))
 
 
 class DatasetSpec(FileSpec):

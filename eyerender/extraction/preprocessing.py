@@ -31,23 +31,14 @@ def as_image(array: NDArray[np.generic]) -> Image:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Prepared:
-    """An image prepared for extraction.
+    """An image prepared for extraction."""
 
-    Attributes:
-        linear: (h, w) float32 linear intensity, full scale 255.
-        clip_dn: level at which the sensor saturates; infinite for float images.
-        noise_dn: standard deviation of a pixel's noise.
-        least_dn: smallest step that is more than rounding and compression.
-        inverted: whether the image is a negative.
-        scale: pixels of the whole image per pixel.
-    """
-
-    linear: Image
-    clip_dn: float
-    noise_dn: float
-    least_dn: float = 0.0
-    inverted: bool = False
-    scale: float = 1.0
+    linear: Image  # (h, w) float32 linear intensity, full scale 255
+    clip_dn: float  # level at which the sensor saturates; infinite for float images
+    noise_dn: float  # standard deviation of a pixel's noise
+    least_dn: float = 0.0  # smallest step that is more than rounding and compression
+    inverted: bool = False  # whether the image is a negative
+    scale: float = 1.0  # pixels of the whole image per pixel
 
     def rescaled(self, scale: float) -> Prepared:
         """Return the image reduced by the factor `scale` (below 1: enlarged), with its noise at that size."""

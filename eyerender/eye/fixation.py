@@ -54,22 +54,14 @@ _STEPS = 20
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixations(ArrayValue):
-    """A batch of fixations, leading axis n.
+    """A batch of fixations, leading axis n."""
 
-    Attributes:
-        poses: poses of the eye.
-        residual_mm: (n,) miss distance of the line of sight (chief ray: from the target; entrance window: from the
-            fovea).
-        status: (n,) of `Status`.
-        line_of_sight_mm: (n, 3) point where the line of sight meets the cornea, in the eye-fixed frame.
-        line_of_sight_direction: (n, 3) unit vectors from there to the target, in the eye-fixed frame.
-    """
-
-    poses: Poses
+    poses: Poses  # poses of the eye
+    # (n,) miss distance of the line of sight (chief ray: from the target; entrance window: from the fovea)
     residual_mm: Floats
-    status: Statuses
-    line_of_sight_mm: Floats
-    line_of_sight_direction: Floats
+    status: Statuses  # (n,) of `Status`
+    line_of_sight_mm: Floats  # (n, 3) point where the line of sight meets the cornea, in the eye-fixed frame
+    line_of_sight_direction: Floats  # (n, 3) unit vectors from there to the target, in the eye-fixed frame
 
     def reason(self, item: int) -> str | None:
         """Return the reason why fixation `item` failed; None if it did not."""

@@ -27,25 +27,15 @@ _SAME_MM = 1e-6
 
 
 class Leg(NamedTuple):
-    """Rays from a camera to points of an eye or by way of its cornea to lamps, past the lenses that are worn.
+    """Rays from a camera to points of an eye or by way of its cornea to lamps, past the lenses that are worn."""
 
-    Attributes:
-        seen: the last point on the way to the camera, where the camera sees the feature.
-        exit: the point on the cornea.
-        way: unit direction on arriving there from the camera.
-        end: unit direction in the last medium.
-        residual_mm: miss distance.
-        status: (...,).
-        passed: number of the choice of lenses passed; -1 where there is no ray.
-    """
-
-    seen: Xyz
-    exit: Xyz
-    way: Xyz
-    end: Xyz
-    residual_mm: Floats
-    status: Statuses
-    passed: Indices
+    seen: Xyz  # the last point on the way to the camera, where the camera sees the feature
+    exit: Xyz  # the point on the cornea
+    way: Xyz  # unit direction on arriving there from the camera
+    end: Xyz  # unit direction in the last medium
+    residual_mm: Floats  # miss distance
+    status: Statuses  # (...,)
+    passed: Indices  # number of the choice of lenses passed; -1 where there is no ray
 
 
 def refracted_legs(eye: EyeModel, lenses: Sequence[WornLens], target: Xyz, viewpoint: Xyz) -> Leg:
@@ -157,33 +147,21 @@ def _one_course(course: Course, viewpoint: Xyz, target: Xyz, thorough: bool) -> 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LensImage:
-    """A reflection of a lamp in a lens.
+    """A reflection of a lamp in a lens."""
 
-    Attributes:
-        lamp: number of the lamp.
-        surface: front or back.
-        index: number of the image in this surface; further lenses go on counting.
-        status: of the image; the numbers below are NaN where it is not OK.
-        met_mm: (3,) where light of the lamp first meets a lens.
-        seen_mm: (3,) the last point on the way to the camera.
-        mirror_mm: (3,) the mirror point.
-        leaving: (3,) unit direction in which the light leaves the lamp.
-        share: share of the light that arrives.
-        cross_section_mm2_sr: cross section of the ray tube at the lamp per solid angle at the camera.
-        residual_mm: miss distance.
-    """
-
-    lamp: int
-    surface: str
-    index: int
-    status: Status
+    lamp: int  # number of the lamp
+    surface: str  # front or back
+    index: int  # number of the image in this surface; further lenses go on counting
+    status: Status  # of the image; the numbers below are NaN where it is not OK
+    # (3,) where light of the lamp first meets a lens
     met_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
-    seen_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
-    mirror_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
+    seen_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))  # (3,) the last point on the way to the camera
+    mirror_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))  # (3,) the mirror point
+    # (3,) unit direction in which the light leaves the lamp
     leaving: Floats = field(default_factory=partial(np.full, 3, np.nan))
-    share: float = np.nan
-    cross_section_mm2_sr: float = np.nan
-    residual_mm: float = np.nan
+    share: float = np.nan  # share of the light that arrives
+    cross_section_mm2_sr: float = np.nan  # cross section of the ray tube at the lamp per solid angle at the camera
+    residual_mm: float = np.nan  # miss distance
 
 
 def lens_images(

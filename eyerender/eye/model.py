@@ -24,20 +24,13 @@ class Stop(ArrayValue):
     """The aperture stop (the anatomical pupil): an ellipse, or a contour about one.
 
     In a batch all arrays have a leading axis, `handed` too.
-
-    Attributes:
-        centre_mm: (3,) centre.
-        rotation: (3, 3) local to eye frame.
-        semi_axes_mm: (2,) semi-axes along local y and z.
-        handed: +1 for a right eye, -1 for a left eye.
-        contour: (2, k) c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0 for
-            an ellipse.
     """
 
-    centre_mm: Floats
-    rotation: Floats
-    semi_axes_mm: Floats
-    handed: Floats
+    centre_mm: Floats  # (3,) centre
+    rotation: Floats  # (3, 3) local to eye frame
+    semi_axes_mm: Floats  # (2,) semi-axes along local y and z
+    handed: Floats  # +1 for a right eye, -1 for a left eye
+    # (2, k) c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0 for an ellipse
     contour: Floats = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:

@@ -40,29 +40,17 @@ class FrameShape:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WornLens(ArrayValue):
-    """A lens in the frame of the unrotated eye or, `turned`, in the frames of n turned eyes; arrays may be batches.
+    """A lens in the frame of the unrotated eye or, `turned`, in the frames of n turned eyes; arrays may be batches."""
 
-    Attributes:
-        front: the surface on the world's side.
-        back: the surface on the eye's side.
-        index: index of refraction.
-        centre_mm: (3,) centre of the outline.
-        rotation: (3, 3) lens to eye frame; its x axis points out of the face.
-        half_mm: (2,) half axes of the elliptical outline along the lens's y and z.
-        reflectances: of front and back at every angle; None: Fresnel's.
-        transmission: of the material.
-        frame: what holds the lens, which pictures show; None: nothing.
-    """
-
-    front: Surface
-    back: Surface
-    index: float
-    centre_mm: Floats
-    rotation: Floats
-    half_mm: tuple[float, float]
-    reflectances: tuple[float, float] | None
-    transmission: float
-    frame: FrameShape | None = None
+    front: Surface  # the surface on the world's side
+    back: Surface  # the surface on the eye's side
+    index: float  # index of refraction
+    centre_mm: Floats  # (3,) centre of the outline
+    rotation: Floats  # (3, 3) lens to eye frame; its x axis points out of the face
+    half_mm: tuple[float, float]  # (2,) half axes of the elliptical outline along the lens's y and z
+    reflectances: tuple[float, float] | None  # of front and back at every angle; None: Fresnel's
+    transmission: float  # of the material
+    frame: FrameShape | None = None  # what holds the lens, which pictures show; None: nothing
 
     def turned(self, turn: Floats, shift_mm: Floats) -> WornLens:
         """Express the lens in frames of turned eyes, x = turn x' + shift_mm, with turn (n, 3, 3) and shift (n, 3)."""
@@ -88,10 +76,7 @@ class WornLens(ArrayValue):
 
     def inward(self) -> tuple[Crossing, ...]:
         """Return the two refractions of light that comes from the world."""
-        return (
-            Crossing(surface=self.front, n_after=self.index),
-            Crossing(surface=self.back, n_after=1.0),
-        )
+        return (Crossing(surface=self.front, n_after=self.index), Crossing(surface=self.back, n_after=1.0))
 
     def outward(self) -> tuple[Crossing, ...]:
         """Return the two refractions of light that comes from the eye."""
@@ -158,21 +143,13 @@ class Course:
     @classmethod
     def of(
         cls,
-        lenses: Sequence[WornLens],
-        before: Choice,
-        middle: Sequence[Crossing],
-        after: Choice = (),
-        own: int | None = None,
+        lenses: Sequence[WornLens],  # all worn lenses, in order from the eye
+        before: Choice,  # those passed on the way from the viewpoint, in the order in which they are passed
+        middle: Sequence[Crossing],  # the crossings of the eye, or those of lens `own` if that is given
+        after: Choice = (),  # those passed on the way to the target, in the order in which they are passed
+        own: int | None = None,  # number of a lens that reflects the ray
     ) -> Course:
-        """Join what the lenses before and after do to the crossings in the middle.
-
-        Args:
-            lenses: all worn lenses, in order from the eye.
-            before: those passed on the way from the viewpoint, in the order in which they are passed.
-            middle: the crossings of the eye, or those of lens `own` if that is given.
-            after: those passed on the way to the target, in the order in which they are passed.
-            own: number of a lens that reflects the ray.
-        """
+        """Join what the lenses before and after do to the crossings in the middle."""
         inwards = own is None or all(k > own for k in (*before, *after))
         steps = [(c, k) for k in before for c in (lenses[k].inward() if inwards else lenses[k].outward())]
         back = [(c, k) for k in after for c in (lenses[k].outward() if inwards else lenses[k].inward())]

@@ -24,21 +24,13 @@ NOT_CALIBRATED = "this eye is not calibrated"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureRays(ArrayValue):
-    """Rays through the features of n observations.
+    """Rays through the features of n observations."""
 
-    Attributes:
-        origin_mm: (n, 3) nodal points.
-        pupil: (n, 3) unit rays to the pupil centre.
-        glints: (n, m, 3) unit rays to the glints; NaN where a frame lacks one.
-        light_mm: (n, m, 3) lights of the glints.
-        reason: (n,) why an observation has no rays, None where it has.
-    """
-
-    origin_mm: Floats
-    pupil: Floats
-    glints: Floats
-    light_mm: Floats
-    reason: Objects
+    origin_mm: Floats  # (n, 3) nodal points
+    pupil: Floats  # (n, 3) unit rays to the pupil centre
+    glints: Floats  # (n, m, 3) unit rays to the glints; NaN where a frame lacks one
+    light_mm: Floats  # (n, m, 3) lights of the glints
+    reason: Objects  # (n,) why an observation has no rays, None where it has
 
 
 def feature_rays(

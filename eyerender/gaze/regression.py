@@ -26,16 +26,7 @@ from ..scene.observation import Observations
 from .builtin import BuiltIn, EstimatorOptions, this_many
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
-from .rays import (
-    calibrated_eyes,
-    chosen_lights,
-    eye_name,
-    eyes_of,
-    glints_of,
-    is_none,
-    screen_of,
-    targets_on_screen,
-)
+from .rays import calibrated_eyes, chosen_lights, eye_name, eyes_of, glints_of, is_none, screen_of, targets_on_screen
 
 
 def _terms(text: str) -> Terms:

@@ -14,9 +14,9 @@ from ..backends.choose import BackendChoice, choose_backend
 from ..base.arrays import Bytes, Floats, Singles
 from ..base.errors import InputError
 from ..base.progress import COMPILING, Progress, followed_by, one_behind
+from ..eye.landmarks import at_cornea_d
 from ..eye.legs import apparent_places
 from ..eye.model import EyeModel
-from ..eye.refraction import at_cornea_d
 from ..folders.imagefile import MAX_PIXELS, compressed
 from ..region.anatomy import Region
 from ..rig.camera import Window

@@ -463,42 +463,26 @@ def mirror_start(
     SHEET=SHEET,
 )
 def connect_all(
-    kinds: Ints,
-    sheets: Sheets,
-    table: Floats,
-    ladder: Floats,
-    rims: Floats,
-    viewpoint: Floats,
-    target: Floats,
+    kinds: Ints,  # kinds of the surfaces, outside in
+    sheets: Sheets,  # (1 or n, s) surfaces
+    table: Floats,  # table of the surfaces
+    ladder: Floats,  # (1 or n, s + 1) index in front of the first surface, then that behind each
+    rims: Floats,  # (1 or n,) radius at which the rimmed surface ends
+    viewpoint: Floats,  # (3, 1 or n, 1 or m) mm
+    target: Floats,  # (3, 1 or n, 1 or m) mm
+    # whether the rimmed surface reflects the rays; those behind it in the list are crossed on the way out
     reflects: bool,
-    rimmed: int,
-    guesses: Floats,
-    exits: Floats,
-    ways: Floats,
-    ends: Floats,
-    residuals: Floats,
-    state: Statuses,
+    rimmed: int,  # number of the surface with a rim, from 1: the outermost one of the eye
+    guesses: Floats,  # (3, n, m) first guesses of mirror points, written if it reflects
+    exits: Floats,  # (3, n, m) points on the outermost surface, written
+    ways: Floats,  # (3, n, m) directions to them from the viewpoint, written
+    ends: Floats,  # (3, n, m) directions in the last medium, written
+    residuals: Floats,  # (n, m) misses of the traced rays, mm, written
+    state: Statuses,  # (n, m), initially LOST, written
 ) -> None:
     """Solve for the rays from viewpoints to targets, through all surfaces; the rimmed one may reflect them instead.
 
     Every path is traced from the viewpoint; a ray that misses the target by more than rounding is LOST.
-
-    Args:
-        kinds: kinds of the surfaces, outside in.
-        sheets: (1 or n, s) surfaces.
-        table: table of the surfaces.
-        ladder: (1 or n, s + 1) index in front of the first surface, then that behind each.
-        rims: (1 or n,) radius at which the rimmed surface ends.
-        viewpoint: (3, 1 or n, 1 or m) mm.
-        target: (3, 1 or n, 1 or m) mm.
-        reflects: whether the rimmed surface reflects the rays; those behind it in the list are crossed on the way out.
-        rimmed: number of the surface with a rim, from 1: the outermost one of the eye.
-        guesses: (3, n, m) first guesses of mirror points, written if it reflects.
-        exits: (3, n, m) points on the outermost surface, written.
-        ways: (3, n, m) directions to them from the viewpoint, written.
-        ends: (3, n, m) directions in the last medium, written.
-        residuals: (n, m) misses of the traced rays, mm, written.
-        state: (n, m), initially LOST, written.
     """
     nodes, surfaces = np.zeros(len(kinds) + 2, dtype=NODE), Surfaces(kinds, sheets, table)
     for first in range(0, state.size, LANES):

@@ -34,23 +34,16 @@ def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ops:
-    """Operations of one array library.
+    """Operations of one array library."""
 
-    Attributes:
-        sqrt: square root.
-        root: the square root in the height of a sheet, `sheet_height`. It decides what follows beyond the sheet's end,
-            where its argument is negative: NaN, or a continuation with which Newton's method can come back.
-        maximum: larger one of two numbers.
-        copysign: the first number with the sign of the second.
-        select: select(mask, a, b) is a where the mask holds, else b.
-        compile: decorator of every formula, for a compiler; default: none.
-    """
-
-    sqrt: Callable[..., Any]
+    sqrt: Callable[..., Any]  # square root
+    # the square root in the height of a sheet, `sheet_height`. It decides what follows beyond the sheet's end, where
+    # its argument is negative: NaN, or a continuation with which Newton's method can come back.
     root: Callable[..., Any]
-    maximum: Callable[..., Any]
-    copysign: Callable[..., Any]
-    select: Callable[..., Any]
+    maximum: Callable[..., Any]  # larger one of two numbers
+    copysign: Callable[..., Any]  # the first number with the sign of the second
+    select: Callable[..., Any]  # select(mask, a, b) is a where the mask holds, else b
+    # decorator of every formula, for a compiler; default: none
     compile: Callable[[Callable[..., Any]], Callable[..., Any]] = _unchanged
 
 
@@ -66,25 +59,15 @@ class Jet(NamedTuple):
 
 
 class Bend(NamedTuple):
-    """A ray behind a surface: w = eta d + f N.
+    """A ray behind a surface: w = eta d + f N."""
 
-    Attributes:
-        way: unit direction w.
-        cosine: c = -d.N before the surface.
-        behind: the same behind it, with the sign of c; -c for a mirror.
-        eta: index before over index behind; 1 for a mirror.
-        factor: f.
-        slope: df/dc, for `bend_differential`.
-        passes: whether light passes; at total reflection w is the grazing direction.
-    """
-
-    way: Vector
-    cosine: Number
-    behind: Number
-    eta: Number
-    factor: Number
-    slope: Number
-    passes: Any
+    way: Vector  # unit direction w
+    cosine: Number  # c = -d.N before the surface
+    behind: Number  # the same behind it, with the sign of c; -c for a mirror
+    eta: Number  # index before over index behind; 1 for a mirror
+    factor: Number  # f
+    slope: Number  # df/dc, for `bend_differential`
+    passes: Any  # whether light passes; at total reflection w is the grazing direction
 
 
 class Formulas(NamedTuple):
@@ -157,11 +140,7 @@ def refraction(ops: Ops) -> Callable[..., Bend]:
         square = 1.0 - eta * eta * (1.0 - cosine * cosine)
         behind = copysign(sqrt(maximum(square, least)), cosine)
         factor = eta * cosine - behind
-        w = (
-            eta * way[0] + factor * normal[0],
-            eta * way[1] + factor * normal[1],
-            eta * way[2] + factor * normal[2],
-        )
+        w = (eta * way[0] + factor * normal[0], eta * way[1] + factor * normal[1], eta * way[2] + factor * normal[2])
         return Bend(w, cosine, behind, eta, factor, eta - eta * eta * cosine / behind, square > 0.0)
 
     return ops.compile(refract)

@@ -15,21 +15,13 @@ from .surfaces import Xyz
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Graphs:
-    """Surfaces over the (y, z) plane of a working frame, p_eye = rotation p + origin_mm.
+    """Surfaces over the (y, z) plane of a working frame, p_eye = rotation p + origin_mm."""
 
-    Attributes:
-        kinds: (s,) kinds of the surfaces.
-        sheets: (1 or n, s) records of the type `SHEET`, one row per eye of a batch.
-        table: coefficients of measured surfaces.
-        origin_mm: (3,) or (n, 3).
-        rotation: (3, 3) or (n, 3, 3).
-    """
-
-    kinds: Ints
-    sheets: Sheets
-    table: Floats
-    origin_mm: Floats
-    rotation: Floats
+    kinds: Ints  # (s,) kinds of the surfaces
+    sheets: Sheets  # (1 or n, s) records of the type `SHEET`, one row per eye of a batch
+    table: Floats  # coefficients of measured surfaces
+    origin_mm: Floats  # (3,) or (n, 3)
+    rotation: Floats  # (3, 3) or (n, 3, 3)
 
     @property
     def plain(self) -> bool:

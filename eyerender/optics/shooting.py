@@ -37,33 +37,19 @@ _RETREATS = 12
 
 
 class Shot(NamedTuple):
-    """Rays shot from a source, one array per coordinate.
+    """Rays shot from a source, one array per coordinate."""
 
-    Attributes:
-        start: unit direction at the source.
-        first: the point on the first crossing.
-        last: the point on the last crossing.
-        turning: the point of the last reflection; the first point if there is none.
-        end: unit direction in the last medium.
-        along: distance (mm) from the last crossing to the point of closest approach to the target.
-        miss: vector from there to the target.
-        residual_mm: its length. For a target more than `FAR_MM` from the last surface it is measured at `FAR_MM`.
-        tubes: a_1 and a_2 of the ray tube (see the module).
-        determinant_mm2_sr: w . (a_1 x a_2), with its sign.
-        status: (...,).
-    """
-
-    start: Xyz
-    first: Xyz
-    last: Xyz
-    turning: Xyz
-    end: Xyz
-    along: Floats
-    miss: Xyz
-    residual_mm: Floats
-    tubes: tuple[Xyz, Xyz]
-    determinant_mm2_sr: Floats
-    status: Statuses
+    start: Xyz  # unit direction at the source
+    first: Xyz  # the point on the first crossing
+    last: Xyz  # the point on the last crossing
+    turning: Xyz  # the point of the last reflection; the first point if there is none
+    end: Xyz  # unit direction in the last medium
+    along: Floats  # distance (mm) from the last crossing to the point of closest approach to the target
+    miss: Xyz  # vector from there to the target
+    residual_mm: Floats  # its length. For a target more than `FAR_MM` from the last surface it is measured at `FAR_MM`.
+    tubes: tuple[Xyz, Xyz]  # a_1 and a_2 of the ray tube (see the module)
+    determinant_mm2_sr: Floats  # w . (a_1 x a_2), with its sign.
+    status: Statuses  # (...,)
 
 
 def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Shot:
@@ -113,16 +99,12 @@ def _undamped(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target:
 
 
 class RayTube(NamedTuple):
-    """The tube of rays around a traced ray, arrays (...) and components.
+    """The tube of rays around a traced ray, arrays (...) and components."""
 
-    Attributes:
-        cross_section_mm2_sr: cross section at the target per solid angle at the source, |w . (a1 x a2)|. If source and
-            target lie in media of the same index, it is the same in both directions.
-        end: the ray's unit direction at the target.
-    """
-
+    # cross section at the target per solid angle at the source, |w . (a1 x a2)|. If source and target lie in media of
+    # the same index, it is the same in both directions.
     cross_section_mm2_sr: Floats
-    end: Xyz
+    end: Xyz  # the ray's unit direction at the target
 
 
 def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:

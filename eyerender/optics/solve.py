@@ -28,21 +28,13 @@ from .trace import Crossing, each, outward_path, trace
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ApparentPoints(ArrayValue):
-    """Points at which rays from object points to a viewpoint leave the outermost surface.
+    """Points at which rays from object points to a viewpoint leave the outermost surface."""
 
-    Attributes:
-        exit_points_mm: (..., 3) points on the outermost surface.
-        directions: (..., 3) unit vectors from the exit point to the viewpoint.
-        inner_directions: (..., 3) unit vectors from the object to the innermost surface.
-        residual_mm: (...,) miss distance of the traced ray.
-        status: (...,).
-    """
-
-    exit_points_mm: Floats
-    directions: Floats
-    inner_directions: Floats
-    residual_mm: Floats
-    status: Statuses
+    exit_points_mm: Floats  # (..., 3) points on the outermost surface
+    directions: Floats  # (..., 3) unit vectors from the exit point to the viewpoint
+    inner_directions: Floats  # (..., 3) unit vectors from the object to the innermost surface
+    residual_mm: Floats  # (...,) miss distance of the traced ray
+    status: Statuses  # (...,)
 
 
 class Rays(NamedTuple):
@@ -60,24 +52,15 @@ class Rays(NamedTuple):
 
 
 def apparent_points(
-    surfaces: Sequence[Surface],
-    indices: Sequence[FloatLike],
-    object_points_mm: npt.ArrayLike,
-    viewpoint_mm: npt.ArrayLike,
+    surfaces: Sequence[Surface],  # outside in
+    indices: Sequence[FloatLike],  # the index behind each surface
+    object_points_mm: npt.ArrayLike,  # (..., 3) points behind the surfaces
+    viewpoint_mm: npt.ArrayLike,  # (..., 3) viewpoints; they broadcast against the object points
     *,
-    rim_mm: FloatLike = np.inf,
-    n_outside: float = 1.0,
+    rim_mm: FloatLike = np.inf,  # rim radius of the outermost surface (the limbus)
+    n_outside: float = 1.0,  # index outside the eye
 ) -> ApparentPoints:
-    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction).
-
-    Args:
-        surfaces: outside in.
-        indices: the index behind each surface.
-        object_points_mm: (..., 3) points behind the surfaces.
-        viewpoint_mm: (..., 3) viewpoints; they broadcast against the object points.
-        rim_mm: rim radius of the outermost surface (the limbus).
-        n_outside: index outside the eye.
-    """
+    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction)."""
     rays = refracted_rays(
         surfaces, indices, components(object_points_mm), components(viewpoint_mm), rim_mm=rim_mm, n_outside=n_outside
     )
@@ -128,13 +111,7 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
 
 
 def joined_rays(
-    path: Sequence[Crossing],
-    n_outside: float,
-    viewpoint: Xyz,
-    target: Xyz,
-    rimmed: int = 0,
-    *,
-    thorough: bool = True,
+    path: Sequence[Crossing], n_outside: float, viewpoint: Xyz, target: Xyz, rimmed: int = 0, *, thorough: bool = True
 ) -> Rays:
     """Solve for the rays from viewpoints through a path to targets: refracted ones, or those that a surface reflects.
 

@@ -132,18 +132,12 @@ class Biconic(GraphSurface):
 
     x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - (1 + Q_y) c_y^2 y^2 - (1 + Q_z) c_z^2 z^2)), c = 1/R
     (Smith & Atchison 1997, "The eye and visual optical instruments", biconic surface.)
-
-    Attributes:
-        origin_mm: (..., 3) apex in the eye frame.
-        rotation: (..., 3, 3) local to eye frame.
-        radii_mm: (..., 2) apex radii (R_y, R_z); positive ones open to -x, negative ones to +x.
-        conic_constants: (..., 2) conic constants (Q_y, Q_z).
     """
 
-    origin_mm: Floats
-    rotation: Floats
-    radii_mm: Floats
-    conic_constants: Floats
+    origin_mm: Floats  # (..., 3) apex in the eye frame
+    rotation: Floats  # (..., 3, 3) local to eye frame
+    radii_mm: Floats  # (..., 2) apex radii (R_y, R_z); positive ones open to -x, negative ones to +x
+    conic_constants: Floats  # (..., 2) conic constants (Q_y, Q_z)
     _untilted: bool = field(init=False, repr=False)
 
     kind: ClassVar[str] = "biconic"

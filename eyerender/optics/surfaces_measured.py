@@ -165,26 +165,16 @@ class Measured(GraphSurface):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ZernikeSurface(Measured):
-    """x = conic(y, z) - sum_j c_j Z_j(y / r, z / r), shifted so that x = 0 on the axis (see `zernike`).
+    """x = conic(y, z) - sum_j c_j Z_j(y / r, z / r), shifted so that x = 0 on the axis (see `zernike`)."""
 
-    Attributes:
-        origin_mm: (..., 3) point on the axis, in the eye frame.
-        rotation: (..., 3, 3) local to eye frame.
-        base: (..., 2) curvature 1/R (1/mm) and conic constant Q of the conic; curvature 0 is a plane.
-        radius_mm: (...,) r, the radius of the disc on which the terms are orthonormal.
-        coefficients_mm: (..., k) c_j, depths towards -x, of all terms up to a radial order.
-        outer: see `Measured`.
-        window_mm: see `Measured`.
-        table: (..., 6, k) coefficients of Chebyshev products, for the height and its derivatives; computed if empty.
-    """
-
-    origin_mm: Floats
-    rotation: Floats
-    base: Floats
-    radius_mm: Floats
-    coefficients_mm: Floats
-    outer: Floats
-    window_mm: Floats
+    origin_mm: Floats  # (..., 3) point on the axis, in the eye frame
+    rotation: Floats  # (..., 3, 3) local to eye frame
+    base: Floats  # (..., 2) curvature 1/R (1/mm) and conic constant Q of the conic; curvature 0 is a plane
+    radius_mm: Floats  # (...,) r, the radius of the disc on which the terms are orthonormal
+    coefficients_mm: Floats  # (..., k) c_j, depths towards -x, of all terms up to a radial order
+    outer: Floats  # see `Measured`
+    window_mm: Floats  # see `Measured`
+    # (..., 6, k) coefficients of Chebyshev products, for the height and its derivatives; computed if empty
     table: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     _untilted: bool = field(init=False, repr=False)
 
@@ -250,26 +240,16 @@ class GridSurface(Measured):
     """x = outer biconic + sum_ij c_ij b(u - i) b(v - j), b the cubic B-spline: a bicubic surface on a biconic.
 
     u and v count the spacings from the first coefficient. A batch keeps the grids of its eyes in one table.
-
-    Attributes:
-        origin_mm: (..., 3) origin of the local frame, in the eye frame.
-        rotation: (..., 3, 3) local to eye frame.
-        outer: see `Measured`.
-        window_mm: see `Measured`.
-        centre_mm: (..., 2) position (y, z) of the middle of the grid.
-        spacing_mm: (...,) spacing of the grid.
-        row: (...,) the surface's grid in the table.
-        table: (e, n, n) coefficients c_ij (mm) of e grids, i along y and j along z; n is odd.
     """
 
-    origin_mm: Floats
-    rotation: Floats
-    outer: Floats
-    window_mm: Floats
-    centre_mm: Floats
-    spacing_mm: Floats
-    row: Indices
-    table: Floats
+    origin_mm: Floats  # (..., 3) origin of the local frame, in the eye frame
+    rotation: Floats  # (..., 3, 3) local to eye frame
+    outer: Floats  # see `Measured`
+    window_mm: Floats  # see `Measured`
+    centre_mm: Floats  # (..., 2) position (y, z) of the middle of the grid
+    spacing_mm: Floats  # (...,) spacing of the grid
+    row: Indices  # (...,) the surface's grid in the table
+    table: Floats  # (e, n, n) coefficients c_ij (mm) of e grids, i along y and j along z; n is odd
     _untilted: bool = field(init=False, repr=False)
 
     kind: ClassVar[str] = "grid"

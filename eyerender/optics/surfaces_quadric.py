@@ -16,21 +16,13 @@ from .transforms import MIRROR, flip_y, read_only
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadric(Surface):
-    """F(p) = p^T A p + 2 b.p + c = 0 in the local frame, on the sheet where g_x = (A p + b)_x > 0.
+    """F(p) = p^T A p + 2 b.p + c = 0 in the local frame, on the sheet where g_x = (A p + b)_x > 0."""
 
-    Attributes:
-        origin_mm: (..., 3) origin of the local frame in the eye frame.
-        rotation: (..., 3, 3) local to eye frame.
-        matrix: (..., 3, 3) A, symmetric.
-        vector: (..., 3) b, mm.
-        constant: (...,) c, mm^2.
-    """
-
-    origin_mm: Floats
-    rotation: Floats
-    matrix: Floats
-    vector: Floats
-    constant: Floats
+    origin_mm: Floats  # (..., 3) origin of the local frame in the eye frame
+    rotation: Floats  # (..., 3, 3) local to eye frame
+    matrix: Floats  # (..., 3, 3) A, symmetric
+    vector: Floats  # (..., 3) b, mm
+    constant: Floats  # (...,) c, mm^2
     _eye: tuple[Floats | float, ...] = field(init=False, repr=False)
     _axial: bool = field(init=False, repr=False)
 

@@ -85,21 +85,13 @@ _NODES, _ORDERS = 200, 16  # r^16 is below 1e-11 for the correlations of refract
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """The table's reference population: moments of its predictors, its regressions, the latent correlations.
+    """The table's reference population: moments of its predictors, its regressions, the latent correlations."""
 
-    Attributes:
-        table: the table.
-        distributions: distribution of each quantity.
-        correlation: (e, e) latent correlations that the table gives within an eye; 0 where it gives none.
-        latent: (s + 2 e, s + 2 e) correlation matrix of subject, right eye and left eye.
-        distance: Frobenius distance between `latent` and the completed matrix, to which it is the nearest correlation
-            matrix.
-    """
-
-    table: PopulationTable
-    distributions: Mapping[str, Distribution]
-    correlation: Floats
-    latent: Floats
+    table: PopulationTable  # the table
+    distributions: Mapping[str, Distribution]  # distribution of each quantity
+    correlation: Floats  # (e, e) latent correlations that the table gives within an eye; 0 where it gives none
+    latent: Floats  # (s + 2 e, s + 2 e) correlation matrix of subject, right eye and left eye
+    # Frobenius distance between `latent` and the completed matrix, to which it is the nearest correlation matrix
     distance: float
 
     @classmethod
@@ -141,15 +133,10 @@ class Reference:
 
 @dataclass(frozen=True)
 class Model:
-    """The joint distribution of one population.
+    """The joint distribution of one population."""
 
-    Attributes:
-        reference: source of the residuals.
-        distributions: distribution of each quantity, replaced ones included.
-    """
-
-    reference: Reference
-    distributions: Mapping[str, Distribution]
+    reference: Reference  # source of the residuals
+    distributions: Mapping[str, Distribution]  # distribution of each quantity, replaced ones included
 
     @cached_property
     def subject_names(self) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from ..base.arrays import Floats
 from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Number, Side, Spec
 from ..eye.fixation import far_sight_mm
-from ..eye.refraction import at_cornea_d
+from ..eye.landmarks import at_cornea_d
 from ..eye.spec import EyeSpec
 from ..region.anatomy import Region
 from ..region.look import Look

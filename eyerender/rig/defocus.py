@@ -125,17 +125,11 @@ def reach_px(diameter_px: float) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer(ArrayValue):
-    """One depth layer of an image, with arrays (height, width).
+    """One depth layer of an image, with arrays (height, width)."""
 
-    Attributes:
-        radiance: sum over the pixel's samples that hit the layer, divided by the number of all samples.
-        coverage: share of the samples that hit the layer.
-        confusion_px: diameter of the circle of confusion; undefined where the coverage is 0.
-    """
-
-    radiance: Reals
-    coverage: Reals
-    confusion_px: Floats
+    radiance: Reals  # sum over the pixel's samples that hit the layer, divided by the number of all samples
+    coverage: Reals  # share of the samples that hit the layer
+    confusion_px: Floats  # diameter of the circle of confusion; undefined where the coverage is 0
 
 
 def blurred(layers: Sequence[Layer], reach: int) -> Singles:

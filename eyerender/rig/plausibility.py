@@ -109,22 +109,15 @@ def timing_warnings(timings: Sequence[FrameTimes]) -> list[InputWarning]:
 
 
 def place_warnings(
-    rig: RigGeometry,
-    eyes_mm: Mapping[str, Floats],
-    heads_mm: Mapping[str, Floats],
-    camera_paths: Sequence[str],
-    light_paths: Sequence[str],
+    rig: RigGeometry,  # the rig
+    eyes_mm: Mapping[str, Floats],  # corneal apexes (3,) in the world by their name in a message
+    heads_mm: Mapping[str, Floats],  # head positions (3,) in the world by their name in a message
+    camera_paths: Sequence[str],  # path of each camera in the input, for messages
+    light_paths: Sequence[str],  # path of each lamp in the input; lamps of one ring share a path and get one warning
 ) -> list[InputWarning]:
     """Warn of impossible places: cameras and lamps in a face, in a head or behind the screen, and a screen in a face.
 
     A lamp in none of these places gets a warning if its axis points past the nearest eye.
-
-    Args:
-        rig: the rig.
-        eyes_mm: corneal apexes (3,) in the world by their name in a message.
-        heads_mm: head positions (3,) in the world by their name in a message.
-        camera_paths: path of each camera in the input, for messages.
-        light_paths: path of each lamp in the input; lamps of one ring share a path and get one warning.
     """
     places = [
         *((path, "camera", camera.nodal_point_mm) for path, camera in zip(camera_paths, rig.cameras, strict=True)),

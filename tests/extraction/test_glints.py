@@ -12,7 +12,7 @@ from eyerender.base.status import Status
 from eyerender.extraction import extract
 from eyerender.extraction.glints import fitting
 from eyerender.extraction.glints.classification import EyeContext, compared, features
-from eyerender.extraction.glints.fits import SpotFit
+from eyerender.extraction.glints.fitting import SpotFit
 from eyerender.extraction.preprocessing import DN, Prepared, prepare
 from eyerender.optics.ellipse import Ellipse
 from tests.support.pixel_model import pixel_profile
@@ -34,11 +34,7 @@ def _errors(condition: str, which: slice) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("condition", "which", "median"),
-    [
-        ("noise2", slice(None), 0.015),
-        ("saturated-glint", slice(None), 0.010),
-        ("edge-glint", slice(0, 1), 0.020),
-    ],
+    [("noise2", slice(None), 0.015), ("saturated-glint", slice(None), 0.010), ("edge-glint", slice(0, 1), 0.020)],
 )
 def test_centre_error(condition, which, median):
     assert np.median(_errors(condition, which)) <= median

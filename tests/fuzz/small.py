@@ -306,9 +306,7 @@ SMALL: dict[str, Reader] = {
     "rig": Reader("a.yaml", _rig, _rig_seeds),
     "plan": Reader("a.yaml", _plan, _plan_seeds),
     "sweep": Reader(
-        "a.yaml",
-        _sweep,
-        lambda: [b"format: 1\nscene: guestrin2006\nsweep:\n  resolution_scale: [1.0, 0.5]\n"],
+        "a.yaml", _sweep, lambda: [b"format: 1\nscene: guestrin2006\nsweep:\n  resolution_scale: [1.0, 0.5]\n"]
     ),
     "named": Reader("a.json", _named, _seeds({"kind": "dataset", "file": "b.obj", "x": ["a.json", 1]})),
     "table-draw": Reader("a.csv", _table_draw, lambda: [b"a,b,w\n1,2,0.5\n3,4e-2,1\n"]),

@@ -14,11 +14,7 @@ from eyerender.gaze.store import choose_estimator
 from eyerender.rig.rig import RigGeometry
 from tests.support.gaze import guestrin
 
-ONE_CAMERA = [
-    er.gaze.Regression("R3"),
-    er.gaze.Hennessey(),
-    er.gaze.GuestrinEizenman(),
-]
+ONE_CAMERA = [er.gaze.Regression("R3"), er.gaze.Hennessey(), er.gaze.GuestrinEizenman()]
 
 
 @pytest.fixture(scope="module")

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.stats import ks_2samp, spearmanr
 
 from eyerender.apps.inspection import inspect
 from eyerender.apps.inspection.comparing import distance_and_chance
 from eyerender.apps.inspection.duplicates import equal_pictures, near_duplicates
+from eyerender.apps.inspection.missing import missing_labels
 from eyerender.apps.inspection.outliers import outliers, scores
+from eyerender.apps.inspection.pictures import measure
 from eyerender.apps.inspection.reading import read
 from eyerender.apps.inspection.statistics import rank_correlations
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
+from eyerender.folders.imagefolder import ImageEntry
 from tests.support.drawn_dataset import FRAMES, draw, packed
 
 
@@ -152,3 +158,29 @@ def test_the_command_writes_page_and_json(data, tmp_path, capsys):
 def test_images_must_be_some(data):
     with pytest.raises(InputError, match="--images: must be >= 1"):
         inspect(data, images=0)
+
+
+def test_leds_of_one_eye_are_not_missing_from_the_other():
+    eyes = np.array(["right", "left"] * 50, dtype=object)
+    x = np.where(eyes == "right", 10.0, np.nan)
+    angle = np.linspace(0.0, 60.0, 100)
+    lost = np.where(angle > 50.0, np.nan, x)
+    columns = {"label glint 0 x (px)": x, "label glint 1 x (px)": lost, "label gaze off straight ahead (deg)": angle}
+    contents: Any = SimpleNamespace(names=["a"] * 100, columns=columns, groups={"eye": eyes})
+    (found,) = missing_labels(cast(Any, contents))
+    assert found.labels == ["label glint 1 x (px)"]
+    assert found.share == np.mean(angle[eyes == "right"] > 50.0)
+    assert found.depends_on == "label gaze off straight ahead (deg)"
+
+
+def test_a_further_mask_that_is_gone_is_a_fault(tmp_path):
+    Image.fromarray(np.arange(192, dtype=np.uint8).reshape(12, 16)).save(tmp_path / "a.png")
+    line: dict[str, Any] = {"file_name": "a.png", "annotated_mask_file_name": "as_annotated/a.png", "bit_depth": 8}
+    line["window_px"] = {"x0": 0, "y0": 0, "width": 16, "height": 12}
+    entry = ImageEntry(folder=tmp_path, line=line, number=1)
+    (found,) = measure(entry).faults
+    assert found.kind == "file"
+    assert "annotated_mask" in found.detail
+    (tmp_path / "as_annotated").mkdir()
+    Image.new("L", (16, 12)).save(tmp_path / "as_annotated" / "a.png")
+    assert measure(entry).faults == []

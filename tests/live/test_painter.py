@@ -11,17 +11,7 @@ import pytest
 from PIL import Image
 
 import eyerender as er
-from eyerender.apps.live.painter import (
-    BUDGET_S,
-    PREVIEW_PX,
-    Order,
-    Pace,
-    Painter,
-    Shown,
-    coarser,
-    enlarged,
-    line_of,
-)
+from eyerender.apps.live.painter import BUDGET_S, PREVIEW_PX, Order, Pace, Painter, Shown, coarser, enlarged, line_of
 from eyerender.apps.live.setup import Setup
 from eyerender.folders.imagefile import preview
 from eyerender.imaging.capture import render_job

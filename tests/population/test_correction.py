@@ -9,8 +9,7 @@ import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.base.spec import EYES
 from eyerender.eye.contact import ContactLens
-from eyerender.eye.landmarks import path_to_retina
-from eyerender.eye.refraction import refraction_d
+from eyerender.eye.landmarks import path_to_retina, refraction_d
 from eyerender.eye.spectacles import SpectacleLens
 from eyerender.optics.trace import trace
 from eyerender.optics.transforms import normalize

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eyerender.apps.realism.figures import BANDS_R, FIGURES, measure, noise
+from eyerender.apps.realism.figures import BANDS_R, FIGURES, Scaled, measure, noise
+from eyerender.apps.realism.folder import FolderFigures
+from eyerender.apps.realism.separability import KINDS, patches
 from eyerender.scene.parts import PUPIL as PUPIL_CLASS
 from tests.realism import drawn
 from tests.realism.drawn import CENTRE, LEVELS, PUPIL, R
@@ -116,3 +118,44 @@ def test_what_a_picture_does_not_show_has_no_figure():
     assert found["skin texture 1"] is None
     assert found["iris : sclera"] == pytest.approx(0.75, abs=0.01)
     assert np.count_nonzero(mask == PUPIL_CLASS) == pytest.approx(np.pi * PUPIL**2, rel=0.01)
+
+
+_IMAGES = 14
+
+
+def _folder(first: int, sigma: float) -> FolderFigures:
+    """A folder of pictures with noise of a scale (px of the picture) on them, of which the irises are compared."""
+    rows = []
+    for seed in range(first, first + _IMAGES):
+        grain = drawn.noise_of_band((drawn.HIGH, drawn.WIDE), sigma, 2 * sigma, seed)
+        shown = patches(Scaled.of(drawn.picture(drawn.levels() * (1 + 0.12 * grain), labelled=False)), seed)
+        rows.append({kind: shown[kind] if kind == "iris" else () for kind in KINDS})
+    return FolderFigures(
+        path=str(first), images=_IMAGES, gamma=1.0, gamma_from="given", landmarks="masks", rows=(), skipped=(),
+        tiles=(), patches=tuple(rows),
+    )  # fmt: skip
+
+
+def test_patches_have_equal_scale_and_exposure():
+    levels = drawn.levels()
+    bright, dark = (patches(Scaled.of(drawn.picture(levels * k)), 1) for k in (1.0, 0.3))
+    assert list(bright) == list(KINDS)
+    assert {p.shape for p in bright["iris"]} == {(20, 20)}
+    for kind in KINDS:
+        for a, b in zip(bright[kind], dark[kind], strict=True):
+            assert np.abs(a.astype(int) - b).max() <= 3  # rounding before and after the compression
+
+
+@pytest.mark.packaging
+def test_only_different_folders_are_told_apart():
+    pytest.importorskip("sklearn")
+    from eyerender.apps.realism.separability import separability
+
+    one, same, other = _folder(0, 8.0), _folder(100, 8.0), _folder(200, 3.5)
+    alike, apart = separability(one, same)["iris"], separability(one, other)["iris"]
+    assert alike.images == (_IMAGES, _IMAGES)
+    assert alike.interval[0] < 0.5 + 0.1  # of fourteen and fourteen images, the area has a standard deviation of .11
+    assert alike.auc < 0.8
+    assert apart.auc > 0.95
+    assert all(len(shown) == 8 for shown in apart.revealing)
+    assert separability(one, other)["sclera"] is None

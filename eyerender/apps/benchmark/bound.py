@@ -35,23 +35,15 @@ _PRIOR_SLOPE, _PRIOR_SHIFT_PX, _PRIOR_LOG_SIGMA = 0.3, 0.5, 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Edge:
-    """The pupil's edge in an image.
+    """The pupil's edge in an image."""
 
-    Attributes:
-        noise_dn: standard deviation s of a pixel's noise, with rounding, DN.
-        step_dn: step from pupil to iris, DN.
-        sigma_px: width sigma_b of the blurred edge, with the pixel, px.
-        arc_deg: part of the outline along which the edge was measured, in degrees of the ellipse's parameter.
-        step_sd_dn: standard error of `step_dn`; 0 if the folder states the edge.
-        sigma_sd_px: standard error of `sigma_px`; 0 if the folder states the edge.
-    """
-
-    noise_dn: float
-    step_dn: float
-    sigma_px: float
+    noise_dn: float  # standard deviation s of a pixel's noise, with rounding, DN
+    step_dn: float  # step from pupil to iris, DN
+    sigma_px: float  # width sigma_b of the blurred edge, with the pixel, px
+    # part of the outline along which the edge was measured, in degrees of the ellipse's parameter
     arc_deg: float = 360.0
-    step_sd_dn: float = 0.0
-    sigma_sd_px: float = 0.0
+    step_sd_dn: float = 0.0  # standard error of `step_dn`; 0 if the folder states the edge
+    sigma_sd_px: float = 0.0  # standard error of `sigma_px`; 0 if the folder states the edge
 
     def centre_sigma_px(self, pupil: Ellipse) -> float:
         """Compute the standard deviation sigma_c per axis, px."""

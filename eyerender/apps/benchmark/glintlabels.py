@@ -31,34 +31,21 @@ _REACH_PX, _EDGE_PX, _MARGIN_PX = 12, 3.0, 4.0
 
 @dataclass(frozen=True, slots=True)
 class GlintLook:
-    """Appearance of a glint in the image.
+    """Appearance of a glint in the image."""
 
-    Attributes:
-        radius_px: radius of a disc with the area of its pixels above half of its peak; 0 if not measured.
-        saturated: whether one of its pixels is at full scale; None if unknown.
-        place: part of the eye behind it; "" if unknown.
-    """
-
-    radius_px: float = 0.0
-    saturated: bool | None = None
-    place: Place = ""
+    radius_px: float = 0.0  # radius of a disc with the area of its pixels above half of its peak; 0 if not measured
+    saturated: bool | None = None  # whether one of its pixels is at full scale; None if unknown
+    place: Place = ""  # part of the eye behind it; "" if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class TrueGlint:
-    """A glint that the image shows.
+    """A glint that the image shows."""
 
-    Attributes:
-        light: its light, -1 if unknown.
-        xy_px: its position in px of the image.
-        visible: visible share.
-        look: size, saturation and place, as far as they are measured.
-    """
-
-    light: int
-    xy_px: tuple[float, float]
-    visible: float = 1.0
-    look: GlintLook = GlintLook()
+    light: int  # its light, -1 if unknown
+    xy_px: tuple[float, float]  # its position in px of the image
+    visible: float = 1.0  # visible share
+    look: GlintLook = GlintLook()  # size, saturation and place, as far as they are measured
 
     def __post_init__(self) -> None:
         """Refuse positions that no image has, with `ValueError`."""

@@ -34,20 +34,15 @@ class Conventions:
     """Conventions of an extractor for positions, axes and angles; the defaults are this package's.
 
     OpenCV's rotated rectangle is full, deg, first, down, centre.
-
-    Attributes:
-        pixel_origin: meaning of (0, 0): the centre of the first pixel, or its outer corner (the centre is then (.5,
-            .5)).
-        axes: semi-axes or full ones.
-        angle_unit: unit of the angle.
-        angle_of: the axis to which the angle belongs: the major one, the minor one, or the first of the two.
-        angle_toward: direction from +x that counts as positive: toward +y, down the image ("down"), or up.
     """
 
+    # meaning of (0, 0): the centre of the first pixel, or its outer corner (the centre is then (.5, .5))
     pixel_origin: Literal["centre", "corner"] = "centre"
-    axes: Literal["semi", "full"] = "semi"
-    angle_unit: Literal["rad", "deg"] = "rad"
+    axes: Literal["semi", "full"] = "semi"  # semi-axes or full ones
+    angle_unit: Literal["rad", "deg"] = "rad"  # unit of the angle
+    # the axis to which the angle belongs: the major one, the minor one, or the first of the two
     angle_of: Literal["major", "minor", "first"] = "major"
+    # direction from +x that counts as positive: toward +y, down the image ("down"), or up
     angle_toward: Literal["down", "up"] = "down"
 
     @classmethod
@@ -138,19 +133,13 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """Self-description of an extractor.
+    """Self-description of an extractor."""
 
-    Attributes:
-        name: its name and version.
-        conventions: the meaning of its numbers.
-        reports: the features that it detects.
-        warms_up: whether its first answer takes longer, because it loads libraries or compiles; the time limit of the
-            start is then added for that answer.
-    """
-
-    name: str
-    conventions: Conventions
-    reports: tuple[str, ...]
+    name: str  # its name and version
+    conventions: Conventions  # the meaning of its numbers
+    reports: tuple[str, ...]  # the features that it detects
+    # whether its first answer takes longer, because it loads libraries or compiles; the time limit of the start is then
+    # added for that answer
     warms_up: bool = False
 
     @classmethod
@@ -189,27 +178,16 @@ class Request:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """Answer of an extractor, in this package's conventions.
+    """Answer of an extractor, in this package's conventions."""
 
-    Attributes:
-        ellipse: the pupil; None if it found none.
-        reason: why it found none.
-        confidence: its confidence, if reported.
-        glints: ((x, y), light or None) in px.
-        cpu_s: processor time, if reported.
-        wall_s: elapsed time, if reported.
-        error: why it failed on this image, in its own words; the rest is then empty.
-        line: the answer as it was sent.
-    """
-
-    ellipse: Ellipse | None = None
-    reason: str | None = None
-    confidence: float | None = None
-    glints: tuple[tuple[tuple[float, float], int | None], ...] = ()
-    cpu_s: float | None = None
-    wall_s: float | None = None
-    error: str | None = None
-    line: str = ""
+    ellipse: Ellipse | None = None  # the pupil; None if it found none
+    reason: str | None = None  # why it found none
+    confidence: float | None = None  # its confidence, if reported
+    glints: tuple[tuple[tuple[float, float], int | None], ...] = ()  # ((x, y), light or None) in px
+    cpu_s: float | None = None  # processor time, if reported
+    wall_s: float | None = None  # elapsed time, if reported
+    error: str | None = None  # why it failed on this image, in its own words; the rest is then empty
+    line: str = ""  # the answer as it was sent
 
     @classmethod
     def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:

@@ -26,24 +26,15 @@ class Setup:
     """A scene with one fixation and one head position, selected from a scene that may have many.
 
     Methods that change something return a new setup, and raise `InputError` for a value that does not fit.
-
-    Attributes:
-        origin: the spec as it was loaded, with all of its fixations and head positions.
-        scene: the current scene, with one fixation and one head position.
-        eye: the selected eye, "right" or "left".
-        camera: number of the selected camera.
-        fixation: number of the current fixation of `origin`; None for a gaze set by the user.
-        head: number of the head position of `origin`.
-        shift_mm: how far all head positions were moved by hand, (x, y, z).
     """
 
-    origin: SceneSpec
-    scene: Scene
-    eye: str
-    camera: int = 0
-    fixation: int | None = 0
-    head: int = 0
-    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: SceneSpec  # the spec as it was loaded, with all of its fixations and head positions
+    scene: Scene  # the current scene, with one fixation and one head position
+    eye: str  # the selected eye, "right" or "left"
+    camera: int = 0  # number of the selected camera
+    fixation: int | None = 0  # number of the current fixation of `origin`; None for a gaze set by the user
+    head: int = 0  # number of the head position of `origin`
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # how far all head positions were moved by hand
 
     @classmethod
     def of(cls, scene: Scene) -> Self:

@@ -14,8 +14,7 @@ from ...base.progress import Progress, followed
 from ...folders.exported import EXPORT, exported_gamma
 from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
 from .folder import FolderFigures, PictureFolder, Skipped, open_source, pictures
-from .patches import patches
-from .separability import MISSING, available, separability, to_mapping
+from .separability import MISSING, available, patches, separability, to_mapping
 
 SCHEMA = "eyerender/realism/2"
 DEFAULT_LIMIT = 200

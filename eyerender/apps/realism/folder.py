@@ -101,17 +101,11 @@ class Skipped:
 
 @dataclass(frozen=True, slots=True)
 class PictureFolder:
-    """A folder of pictures.
+    """A folder of pictures."""
 
-    Attributes:
-        path: the folder.
-        names: names of the images, relative to the folder.
-        entries: the entries of the images, if this package wrote the folder.
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    entries: tuple[ImageEntry, ...] = ()
+    path: Path  # the folder
+    names: tuple[str, ...]  # names of the images, relative to the folder
+    entries: tuple[ImageEntry, ...] = ()  # the entries of the images, if this package wrote the folder
 
     @property
     def landmarks(self) -> str:
@@ -121,29 +115,17 @@ class PictureFolder:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FolderFigures:
-    """Statistics of a folder.
+    """Statistics of a folder."""
 
-    Attributes:
-        path: the folder.
-        images: how many images were read.
-        gamma: the images store intensity^(1 / gamma).
-        gamma_from: source of this gamma: stated by the folder, given, or "assumed".
-        landmarks: source of pupil and iris.
-        rows: name and statistics of each measured image.
-        skipped: images that could not be measured.
-        tiles: every measured image, cropped around its eye, at equal scale.
-        patches: patches of every measured image, by kind.
-    """
-
-    path: str
-    images: int
-    gamma: float
-    gamma_from: str
-    landmarks: str
-    rows: tuple[tuple[str, dict[str, float | None]], ...]
-    skipped: tuple[Skipped, ...]
-    tiles: tuple[Bytes, ...]
-    patches: tuple[dict[str, tuple[Bytes, ...]], ...]
+    path: str  # the folder
+    images: int  # how many images were read
+    gamma: float  # the images store intensity^(1 / gamma)
+    gamma_from: str  # source of this gamma: stated by the folder, given, or "assumed"
+    landmarks: str  # source of pupil and iris
+    rows: tuple[tuple[str, dict[str, float | None]], ...]  # name and statistics of each measured image
+    skipped: tuple[Skipped, ...]  # images that could not be measured
+    tiles: tuple[Bytes, ...]  # every measured image, cropped around its eye, at equal scale
+    patches: tuple[dict[str, tuple[Bytes, ...]], ...]  # patches of every measured image, by kind
 
     def values(self, name: str) -> list[float]:
         """Return the values of a statistic in all images that have it."""

@@ -116,25 +116,16 @@ PixelsOf = Callable[[str], NDArray[Any] | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingItem:
-    """One picture with labels.
+    """One picture with labels."""
 
-    Attributes:
-        parts: the requested parts by name; pictures are (h, w) or (h, w, channels).
-        size: (width, height) px.
-        shown: (2,) visible share of pupil and iris. What lies outside the picture or under a patch is not visible.
-        there: whether the picture shows an eye, open or shut.
-        mask: (h, w) visible parts of the eye, needed where a part of the picture may be cut off.
-        lamps: (n,) number that each lamp has in the mirrored picture; None if it keeps its own.
-        mirrored: whether picture and labels are mirrored.
-    """
-
-    parts: dict[str, Any]
-    size: tuple[int, int]
+    parts: dict[str, Any]  # the requested parts by name; pictures are (h, w) or (h, w, channels)
+    size: tuple[int, int]  # (width, height) px
+    # (2,) visible share of pupil and iris. What lies outside the picture or under a patch is not visible.
     shown: Floats
-    there: bool = True
-    mask: Bytes | None = None
-    lamps: Ints | None = None
-    mirrored: bool = False
+    there: bool = True  # whether the picture shows an eye, open or shut
+    mask: Bytes | None = None  # (h, w) visible parts of the eye, needed where a part of the picture may be cut off
+    lamps: Ints | None = None  # (n,) number that each lamp has in the mirrored picture; None if it keeps its own
+    mirrored: bool = False  # whether picture and labels are mirrored
 
     def valid(self) -> dict[str, Bools]:
         """Return which labels mean anything, by part: a flag for an ellipse, a vector, a place or a plain number."""

@@ -19,24 +19,16 @@ from .place import Placement, mirrored, placed
 class Preparation:
     """What becomes of each picture.
 
-    Attributes:
-        parts: names of `PARTS`.
-        encoding: `stored` or `linear`.
-        size: (width, height) of the result; None: that of the picture.
-        lights: number of rows of `glints`; None: the number of the rig's lamps.
-        mirror_left: whether pictures of left eyes are mirrored.
-        augment: random changes.
-
     Raises:
         InputError: no part is named, one is unknown, or a value is out of range.
     """
 
-    parts: tuple[str, ...]
-    encoding: str = "stored"
-    size: tuple[int, int] | None = None
-    lights: int | None = None
-    mirror_left: bool = False
-    augment: Augmentation | None = None
+    parts: tuple[str, ...]  # names of `PARTS`
+    encoding: str = "stored"  # `stored` or `linear`
+    size: tuple[int, int] | None = None  # (width, height) of the result; None: that of the picture
+    lights: int | None = None  # number of rows of `glints`; None: the number of the rig's lamps
+    mirror_left: bool = False  # whether pictures of left eyes are mirrored
+    augment: Augmentation | None = None  # random changes
 
     def __post_init__(self) -> None:
         if not self.parts:

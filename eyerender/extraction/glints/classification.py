@@ -21,7 +21,7 @@ from ..result import GlintResult
 from ..settings import ExtractionSettings
 from ..weights import glint_weights
 from .detection import optics_sigma
-from .fits import SpotFit
+from .fitting import SpotFit
 
 # Largest counted steps by which the background is brighter than the iris; more is not worse, because the sclera is as
 # bright.
@@ -58,25 +58,15 @@ FIRST, SECOND = glint_weights()  # of the features, and of the comparison
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EyeContext:
-    """Properties of the eye by which spots are judged.
+    """Properties of the eye by which spots are judged."""
 
-    Attributes:
-        ellipse: the pupil.
-        blur_px: blur of the pupil's edge.
-        pupil_dn: level inside the pupil.
-        iris_dn: level just outside the pupil.
-        support: visible share of its boundary.
-        clip_dn: level at which the sensor clips.
-        linear: the image.
-    """
-
-    ellipse: Ellipse
-    blur_px: float
-    pupil_dn: float
-    iris_dn: float
-    support: float
-    clip_dn: float
-    linear: Image
+    ellipse: Ellipse  # the pupil
+    blur_px: float  # blur of the pupil's edge
+    pupil_dn: float  # level inside the pupil
+    iris_dn: float  # level just outside the pupil
+    support: float  # visible share of its boundary
+    clip_dn: float  # level at which the sensor clips
+    linear: Image  # the image
 
     @property
     def step_dn(self) -> float:

@@ -13,8 +13,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats
 from ..preprocessing import DN, Image
-from .fits import SpotFit, joined
-from .fitting import UNEXPLAINED, Limits, fit_spots, window_radius
+from .fitting import UNEXPLAINED, Limits, SpotFit, fit_spots, joined, window_radius
 
 Background = Callable[[Floats, Floats], Floats]
 Starts = tuple[Floats, Floats, Floats]

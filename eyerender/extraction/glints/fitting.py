@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +23,39 @@ from ...base.jit import compiled, inlined
 from ..preprocessing import DN, Image
 from ..products import add_products, copy, largest_size, solve
 from .detection import SMOOTH_PX
-from .fits import SpotFit
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SpotFit:
+    """A batch of fitted spots."""
+
+    xy_px: Floats  # (n, 2) centres
+    covariance: Floats  # (n, 2, 2) of the centres, px^2
+    amplitude_dn: Floats  # (n,) peak above the background
+    sigma_px: Floats  # (n, 2) standard deviations along x and y
+    background_dn: Floats  # (n,) level of the background at the centre
+    residual_dn: Floats  # (n,) root mean square over the window
+    # (n, 2, 2) second moments of the bright patch: those of the Gaussian if it explains the pixels, else those of the
+    # part above a third of the height, without background and other spots
+    moments_px2: Floats
+    clipped: Indices  # (n,) number of clipped pixels
+    converged: Bools  # (n,) whether the fit converged
+
+    def taken(self, index: Indices) -> SpotFit:
+        """Select the spots with these indices."""
+        return SpotFit(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
+
+    def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
+        """Copy, with the spots at these indices replaced by those of `other`."""
+        order = np.arange(self.converged.size)
+        order[index] = order.size + np.arange(index.size)
+        return joined([self, other]).taken(order)
+
+
+def joined(parts: list[SpotFit]) -> SpotFit:
+    """Concatenate several batches."""
+    return SpotFit(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)})
+
 
 PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
 LARGEST_PX = 20.0  # radius of a window at most

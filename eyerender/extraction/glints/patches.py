@@ -17,7 +17,7 @@ from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Prepared
 from ..pupil.glare import around
 from ..statistics import median
-from .fits import SpotFit, joined
+from .fitting import SpotFit, joined
 
 # Share of the brightest level near the pupil, step between pixels, least pixels of a patch, most patches. First those
 # with a dull middle, as overloaded sensors show bright glints; then saturated ones, some pixels of which compression

@@ -12,8 +12,7 @@ from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, ImagePart, Prepared
 from ..pupil.glare import around
 from .detection import Spots
-from .fits import SpotFit
-from .fitting import LARGEST_PX, profile
+from .fitting import LARGEST_PX, SpotFit, profile
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.

@@ -30,28 +30,17 @@ ALL_SEEN = 0.9  # share of the outline that no lid or lashes hide
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BoundaryFit:
-    """An ellipse fitted to edge points, corrected for curvature.
+    """An ellipse fitted to edge points, corrected for curvature."""
 
-    Attributes:
-        ellipse: the ellipse.
-        inliers: (n,) which edge points it is fitted to.
-        points_px: those points, corrected.
-        support: share of the outline that they cover.
-        gap: share of the outline in the longest stretch without points.
-        residual_px: rms distance of the points.
-        noise_px: the same as noise alone would make it.
-        sums: sums over the points, for the covariance and the leverage.
-        covariance: (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and the hidden part of the outline.
-    """
-
-    ellipse: Ellipse
-    inliers: Bools
-    points_px: Floats
-    support: float
-    gap: float
-    residual_px: float
-    noise_px: float
-    sums: EdgeSums
+    ellipse: Ellipse  # the ellipse
+    inliers: Bools  # (n,) which edge points it is fitted to
+    points_px: Floats  # those points, corrected
+    support: float  # share of the outline that they cover
+    gap: float  # share of the outline in the longest stretch without points
+    residual_px: float  # rms distance of the points
+    noise_px: float  # the same as noise alone would make it
+    sums: EdgeSums  # sums over the points, for the covariance and the leverage
+    # (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and the hidden part of the outline
     covariance: Floats
 
 

@@ -60,19 +60,12 @@ def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeSums:
-    """Sums over edge points near an ellipse, over all and over each group of three sectors.
+    """Sums over edge points near an ellipse, over all and over each group of three sectors."""
 
-    Attributes:
-        matrix: (5, 5) sum of products of the distance's slopes.
-        scores: (5, GROUPS) sum of slopes times distance.
-        slopes: (5, GROUPS) sum of slopes.
-        count: (GROUPS,) number of points.
-    """
-
-    matrix: Floats
-    scores: Floats
-    slopes: Floats
-    count: Indices
+    matrix: Floats  # (5, 5) sum of products of the distance's slopes
+    scores: Floats  # (5, GROUPS) sum of slopes times distance
+    slopes: Floats  # (5, GROUPS) sum of slopes
+    count: Indices  # (GROUPS,) number of points
 
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:

@@ -38,25 +38,15 @@ _BELL = np.exp(-0.5 * _STEPS**2) / math.sqrt(2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EdgeModel:
-    """The pupil's edge as a blurred step across an ellipse.
+    """The pupil's edge as a blurred step across an ellipse."""
 
-    Attributes:
-        ellipse: the pupil boundary.
-        inner_dn: inner level, DN.
-        outer: (1 + 2 K,) Fourier coefficients of the outer level (1, cos u, sin u, cos 2u, ...), DN.
-        sigma_px: width of the blur.
-        slope: slope of the outer level, DN per px.
-        kurtosis: kurtosis of the blur beyond a Gaussian's 0.
-        lean: (cos u, sin u) coefficients of the inner level, DN.
-    """
-
-    ellipse: Ellipse
-    inner_dn: float
-    outer: Floats
-    sigma_px: float
-    slope: float = 0.0
-    kurtosis: float = 0.0
-    lean: tuple[float, float] = (0.0, 0.0)
+    ellipse: Ellipse  # the pupil boundary
+    inner_dn: float  # inner level, DN
+    outer: Floats  # (1 + 2 K,) Fourier coefficients of the outer level (1, cos u, sin u, cos 2u, ...), DN
+    sigma_px: float  # width of the blur
+    slope: float = 0.0  # slope of the outer level, DN per px
+    kurtosis: float = 0.0  # kurtosis of the blur beyond a Gaussian's 0
+    lean: tuple[float, float] = (0.0, 0.0)  # (cos u, sin u) coefficients of the inner level, DN
 
     def numbers(self) -> Floats:
         """Return the parameters (11 + 1 + 2 K,).

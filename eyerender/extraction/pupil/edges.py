@@ -41,23 +41,14 @@ DOUBLE = 0.7  # share of a boundary that recurs in a double image; drawn ones ha
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EdgePoints:
-    """Edge points along a boundary.
+    """Edge points along a boundary."""
 
-    Attributes:
-        points_px: (n, 2) ridge of the gradient, not corrected for curvature.
-        normals: (n, 2) unit normals, from dark to bright.
-        ridge: (m,) rows and (m,) columns of all ridge pixels, before the tests.
-        kept: (m,) which ridge pixels became edge points.
-        sigma_px: width of the whole smoothing (optics, pixel and filter), measured across the edge.
-        filter_px: sigma of the filter alone.
-    """
-
-    points_px: Floats
-    normals: Floats
-    ridge: tuple[Indices, Indices]
-    kept: Bools
-    sigma_px: float
-    filter_px: float
+    points_px: Floats  # (n, 2) ridge of the gradient, not corrected for curvature
+    normals: Floats  # (n, 2) unit normals, from dark to bright
+    ridge: tuple[Indices, Indices]  # (m,) rows and (m,) columns of all ridge pixels, before the tests
+    kept: Bools  # (m,) which ridge pixels became edge points
+    sigma_px: float  # width of the whole smoothing (optics, pixel and filter), measured across the edge
+    filter_px: float  # sigma of the filter alone
 
     def arcs(self) -> Indices:
         """Label the connected pieces on which the points lie, (n,)."""

@@ -35,19 +35,12 @@ _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FLANK_PX + 1, 2 * FLAN
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inpainted:
-    """An image in which glints near a candidate are replaced by the level around them.
+    """An image in which glints near a candidate are replaced by the level around them."""
 
-    Attributes:
-        linear: (h, w) the image as it is, DN.
-        corner: column and row of the part that differs.
-        patch: (k, l) that part, DN.
-        mask: (k, l) which of its pixels are replaced.
-    """
-
-    linear: Image
-    corner: tuple[int, int] = (0, 0)
-    patch: Image | None = None
-    mask: Bools | None = None
+    linear: Image  # (h, w) the image as it is, DN
+    corner: tuple[int, int] = (0, 0)  # column and row of the part that differs
+    patch: Image | None = None  # (k, l) that part, DN
+    mask: Bools | None = None  # (k, l) which of its pixels are replaced
 
     def cut(self, columns: slice, rows: slice) -> tuple[Image, Bools]:
         """Cut out a part: its levels, and which of its pixels are replaced."""

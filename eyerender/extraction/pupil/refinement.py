@@ -74,30 +74,17 @@ TURNS = 4  # largest number of fits; each leaves out what the previous one could
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PixelFit:
-    """The result of a refinement.
+    """The result of a refinement."""
 
-    Attributes:
-        model: the fitted pixel model.
-        ellipse: its ellipse, rounder where nothing is seen.
-        covariance: (5, 5) of (cx, cy, a, b, angle).
-        reduced_chi2: reduced chi^2 relative to the image's noise.
-        sectors: (SECTORS,) which sectors of the outline were used.
-    """
-
-    model: EdgeModel
-    ellipse: Ellipse
-    covariance: Floats
-    reduced_chi2: float
-    sectors: Bools
+    model: EdgeModel  # the fitted pixel model
+    ellipse: Ellipse  # its ellipse, rounder where nothing is seen
+    covariance: Floats  # (5, 5) of (cx, cy, a, b, angle)
+    reduced_chi2: float  # reduced chi^2 relative to the image's noise
+    sectors: Bools  # (SECTORS,) which sectors of the outline were used
 
 
 def refine(
-    part: ImagePart,
-    start: EdgeModel,
-    sectors: Bools,
-    masked: Bools,
-    noise_dn: float,
-    scatter_px: float,
+    part: ImagePart, start: EdgeModel, sectors: Bools, masked: Bools, noise_dn: float, scatter_px: float
 ) -> PixelFit | str:
     """Fit the pixel model, or return the reason for failure.
 

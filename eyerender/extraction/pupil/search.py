@@ -101,16 +101,12 @@ def continues(before: Ellipse, found: Ellipse) -> bool:
 
 @dataclass(slots=True)
 class _Outlines:
-    """What a search has found: boundaries to choose from, and outlines in pixels of the whole image.
+    """What a search has found: boundaries to choose from, and outlines in pixels of the whole image."""
 
-    Attributes:
-        choices: boundaries that may be the answer.
-        cored: outlines with a darker middle, of an iris, or of a pupil with reflections near its rim.
-        seen: outlines of which a part is seen, which may be the pupil in an iris.
-    """
-
-    choices: list[ScoredCandidate] = field(default_factory=list)
+    choices: list[ScoredCandidate] = field(default_factory=list)  # boundaries that may be the answer
+    # outlines with a darker middle, of an iris, or of a pupil with reflections near its rim
     cored: list[Ellipse] = field(default_factory=list)
+    # outlines of which a part is seen, which may be the pupil in an iris
     seen: list[Ellipse] = field(default_factory=list)
 
     def add(self, scored: ScoredCandidate, late: bool) -> bool:
