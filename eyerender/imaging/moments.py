@@ -14,6 +14,7 @@ from ..eye.pose import Poses, rigid_motion
 from ..rig.imaging import Motion
 from ..scene.observation import EYES
 from .renderable import RenderableFrames
+from .shared import moving_part, share_lids
 
 if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob, SubFrames
@@ -94,13 +95,16 @@ def _in_sequence(
         return ()
     parts, labelled = [], _Labelled(timing.seen([start], rows[None], lights).time_s[0], start, edges, counts)
     moves = sum(counts) > len(counts)
-    for k, count in enumerate(counts):
+    inner = [np.linspace(*pair, count + 1) for pair, count in zip(pairwise(edges), counts, strict=True)]
+    times = [start + (low + high) / 2.0 for part in inner for low, high in pairwise(part)]
+    then = frames.at(np.full(len(times), row), np.array(times))
+    shared = share_lids([job_of(then, k) for k in range(len(times))])
+    moving = moving_part(shared)
+    for k in range(len(counts)):
         if not on[k].any() and not _is_lit_otherwise(middle):
             continue
-        inner = np.linspace(edges[k], edges[k + 1], count + 1)
         jobs = []
-        for n, time_s in enumerate((inner[:-1] + inner[1:]) / 2.0):
-            job = job_of(frames.at([row], np.array([start + time_s])), 0)
+        for n, job in enumerate(shared[labelled.first[k] : labelled.first[k + 1]]):
             dimmed = tuple(
                 lamp if lit else replace(lamp, intensity_mw_sr=0.0) for lamp, lit in zip(job.lights, on[k], strict=True)
             )
@@ -108,16 +112,20 @@ def _in_sequence(
             if moves:
                 seed = int(np.random.SeedSequence([middle.seed, k, n]).generate_state(1, np.uint64)[0])
             jobs.append(replace(job, lights=dimmed, seed=seed, labels=False))
-        shares = timing.shares(inner, rows)
+        shares = timing.shares(inner[k], rows)
         if timing.is_rolling or timing.field_delay_s:
             parts += [
-                SubFrames(jobs=(job,), rows=share, labelled=labelled.rows(k, n) if timing.is_rolling else None)
+                SubFrames(
+                    jobs=(job,), rows=share, moving=moving, labelled=labelled.rows(k, n) if timing.is_rolling else None
+                )
                 for n, (job, share) in enumerate(zip(jobs, shares, strict=True))
                 if share.any()
             ]
         else:
             whole = shares.sum(axis=0)
-            parts.append(SubFrames(jobs=tuple(jobs), rows=None if (whole > 1.0 - 1e-12).all() else whole))
+            parts.append(
+                SubFrames(jobs=tuple(jobs), rows=None if (whole > 1.0 - 1e-12).all() else whole, moving=moving)
+            )
     return tuple(parts) or (SubFrames(jobs=(replace(middle, labels=False),), rows=np.zeros(len(rows))),)
 
 

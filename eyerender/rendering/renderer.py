@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Singles, frozen
+from ..rig.camera import Window
 from .glints.splatting import MirrorImages, Shine
 from .integrator.film import coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
@@ -26,6 +27,8 @@ from .scene.region import RegionScene
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
+
+_SIZES = 32  # px
 
 
 class Renderer:
@@ -86,10 +89,12 @@ class Renderer:
         """Trace a job, or the sub-frames of its exposure; take labels and glints from mid-exposure."""
         parts = moments or (SubFrames(jobs=(job,)),)
         shots = [(shot, part) for part in parts for shot in part.jobs]
-        # The light that moments share is that of the middle, from which they differ least.
+        # The light that moments share is that of the middle, from which they differ least; lids move little from each
+        # moment to the next.
         middle = len(shots) // 2
-        shots = [shots[k] for k in sorted(range(len(shots)), key=lambda k: abs(k - middle))]
-        spp = max(1, (spp or self.spp) // _shots_of_a_row(parts))
+        shots = shots[middle::-1] + shots[middle + 1 :]
+        whole_spp = spp or self.spp
+        spp = max(1, whole_spp // _shots_of_a_row(parts))
         blur: Blur | None = None
         pictures: dict[int, list[Singles]] = {id(part): [] for part in parts}
         glints: dict[int, list[Shine]] = {id(part): [] for part in parts}
@@ -97,22 +102,32 @@ class Renderer:
         marks: tuple[Any, ...] | None = None
         rows: list[tuple[Bools, PartLabels]] = []
         around: Callable[[], Singles] | None = None
-        lit: dict[tuple[float, ...], DeviceFrame] = {}  # a frame for each state of the lamps
+        # A frame for each state of the lamps, and its picture, from which others differ in their moving part alone.
+        lit: dict[tuple[float, ...], DeviceFrame] = {}
+        still: dict[tuple[float, ...], Singles] = {}
+        images: MirrorImages | None = None
         for shot, part in shots:
             lamps = tuple(lamp.intensity_mw_sr for lamp in shot.lights)
             bound, surroundings = self._builder.set(shot, after=None if moments else after, before=lit.get(lamps))
             lit.setdefault(lamps, bound.frame)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
-            means = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
+            # Beyond its moving part and its rows, a moment has the picture of the first one under the same lamps.
+            base = still.get(lamps)
+            window = blur.window if base is None else _inside(blur.window, part.moving, part.rows)
+            stands = base is None and _inside(blur.window, part.moving) != blur.window
+            samples = whole_spp if stands else spp
+            means = start(bound, window, samples, shot.seed, layered=blur.layered)
             if shot is shots[0][0]:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job, surroundings) if _is_middle(shot, job) else None
             own = None if part.labelled is None else part_labels(bound, job.window)
             self._builder.prepare()
-            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(part.jobs))
+            images = self._mirror_images(bound.host, images)
+            mirrored, shines = images.seen(surroundings, blur, 1 / len(part.jobs))
             glints[id(part)] += shines
             mean, missed = means()
+            mean = still.setdefault(lamps, mean) if base is None else _inserted(base, blur.window, mean, window)
             pictures[id(part)].append(mean)
             failed += missed
             if found is not None:
@@ -137,12 +152,13 @@ class Renderer:
             lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around(),
         )  # fmt: skip
 
-    def _mirror_images(self, host: HostData) -> MirrorImages:
+    def _mirror_images(self, host: HostData, before: MirrorImages | None = None) -> MirrorImages:
         """Compute the lamps' mirror images, in the closed-form cornea or its mesh."""
         job = host.job
-        if job.mesh_edge_mm is None:
+        if job.mesh_edge_mm is None and before is None:
             return host.mirror_images
-        return MirrorImages.of(job, self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0])
+        mesh = None if job.mesh_edge_mm is None else self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0]
+        return MirrorImages.of(job, mesh, before)
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Render the mean of radiance times cos^4(theta) / D (mW/mm^2/sr) per pixel, before lens and glints."""
@@ -159,6 +175,32 @@ class Renderer:
         lit: whether to compute light, not only geometry.
         """
         return self._builder.set(job, lit=lit)
+
+
+def _inside(window: Window, part: Window | None, rows: Floats | None = None) -> Window:
+    """Return a part of a window, in those of its rows that get light; all of it without a part.
+
+    Its sizes are multiples of `_SIZES`, because each size has recordings of its own. `rows` are those of the window
+    without the border that the lens needs.
+    """
+    low, size = np.array(window[:2]), np.array(window[2:])
+    first, last = (low, low + size) if part is None else (np.array(part[:2]), np.add(part[:2], part[2:]))
+    if rows is not None:
+        pad, lit = (window[3] - len(rows)) // 2, np.flatnonzero(rows)
+        first = np.maximum(first, [first[0], low[1] + lit[0]])
+        last = np.minimum(last, [last[0], low[1] + lit[-1] + 2 * pad + 1])
+    first = np.clip(first, low, low + size - 1)
+    wanted = np.clip(last, first + 1, low + size) - first
+    wanted = np.minimum(-(-wanted // _SIZES) * _SIZES, size)
+    first = np.minimum(first, low + size - wanted)
+    return int(first[0]), int(first[1]), int(wanted[0]), int(wanted[1])
+
+
+def _inserted(picture: Singles, window: Window, part: Singles, inner: Window) -> Singles:
+    """Replace a part of a picture (..., height, width) by that of a window within its own."""
+    out, x, y = picture.copy(), inner[0] - window[0], inner[1] - window[1]
+    out[..., y : y + inner[3], x : x + inner[2]] = part
+    return out
 
 
 def _shots_of_a_row(parts: Sequence[SubFrames]) -> int:
