@@ -12,7 +12,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Singles, frozen
 from ..rig.camera import Window
 from .glints.splatting import MirrorImages, Shine
-from .integrator.film import coarse_sensor, mean_radiance, start
+from .integrator.film import Means, coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import BoundFrame, HostData
 from .output.geometry import Hits, window_hits
@@ -93,8 +93,7 @@ class Renderer:
         # moment to the next.
         middle = len(shots) // 2
         shots = shots[middle::-1] + shots[middle + 1 :]
-        whole_spp = spp or self.spp
-        spp = max(1, whole_spp // _shots_of_a_row(parts))
+        film = _Film(spp or self.spp, parts)
         blur: Blur | None = None
         pictures: dict[int, list[Singles]] = {id(part): [] for part in parts}
         glints: dict[int, list[Shine]] = {id(part): [] for part in parts}
@@ -102,21 +101,14 @@ class Renderer:
         marks: tuple[Any, ...] | None = None
         rows: list[tuple[Bools, PartLabels]] = []
         around: Callable[[], Singles] | None = None
-        # A frame for each state of the lamps, and its picture, from which others differ in their moving part alone.
-        lit: dict[tuple[float, ...], DeviceFrame] = {}
-        still: dict[tuple[float, ...], Singles] = {}
+        lit: dict[tuple[float, ...], DeviceFrame] = {}  # a frame for each state of the lamps
         images: MirrorImages | None = None
         for shot, part in shots:
-            lamps = tuple(lamp.intensity_mw_sr for lamp in shot.lights)
+            lamps = _lamps(shot)
             bound, surroundings = self._builder.set(shot, after=None if moments else after, before=lit.get(lamps))
             lit.setdefault(lamps, bound.frame)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
-            # Beyond its moving part and its rows, a moment has the picture of the first one under the same lamps.
-            base = still.get(lamps)
-            window = blur.window if base is None else _inside(blur.window, part.moving, part.rows)
-            stands = base is None and _inside(blur.window, part.moving) != blur.window
-            samples = whole_spp if stands else spp
-            means = start(bound, window, samples, shot.seed, layered=blur.layered)
+            means = film.start(bound, blur, part)
             if shot is shots[0][0]:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
@@ -127,7 +119,6 @@ class Renderer:
             mirrored, shines = images.seen(surroundings, blur, 1 / len(part.jobs))
             glints[id(part)] += shines
             mean, missed = means()
-            mean = still.setdefault(lamps, mean) if base is None else _inserted(base, blur.window, mean, window)
             pictures[id(part)].append(mean)
             failed += missed
             if found is not None:
@@ -177,6 +168,46 @@ class Renderer:
         return self._builder.set(job, lit=lit)
 
 
+def _lamps(job: RenderJob) -> tuple[float, ...]:
+    """Return the state of a job's lamps."""
+    return tuple(lamp.intensity_mw_sr for lamp in job.lights)
+
+
+class _Film:
+    """Pictures of moments, which differ from the first one under the same lamps in their moving part and rows alone.
+
+    Args:
+        spp: samples per pixel of the whole exposure.
+        parts: its moments.
+    """
+
+    def __init__(self, spp: int, parts: Sequence[SubFrames]) -> None:
+        self._spp, self._each = spp, max(1, spp // _shots_of_a_row(parts))
+        self._still: dict[tuple[float, ...], Singles] = {}
+
+    def start(self, bound: BoundFrame, blur: Blur, part: SubFrames) -> Means:
+        """Start rendering a moment, as `film.start` does."""
+        job, whole = bound.host.job, blur.window
+        base = self._still.get(_lamps(job))
+        if base is None:
+            stands = _inside(whole, part.moving) != whole
+            means = start(bound, whole, self._spp if stands else self._each, job.seed, layered=blur.layered)
+            window = whole
+        else:
+            window = _inside(whole, part.moving, part.rows)
+            means = start(bound, window, self._each, job.seed, layered=blur.layered)
+
+        def read() -> tuple[Singles, int]:
+            mean, failed = means()
+            picture = mean if base is None else base.copy()
+            x, y = window[0] - whole[0], window[1] - whole[1]
+            picture[..., y : y + window[3], x : x + window[2]] = mean
+            self._still.setdefault(_lamps(job), picture)
+            return picture, failed
+
+        return read
+
+
 def _inside(window: Window, part: Window | None, rows: Floats | None = None) -> Window:
     """Return a part of a window, in those of its rows that get light; all of it without a part.
 
@@ -194,13 +225,6 @@ def _inside(window: Window, part: Window | None, rows: Floats | None = None) -> 
     wanted = np.minimum(-(-wanted // _SIZES) * _SIZES, size)
     first = np.minimum(first, low + size - wanted)
     return int(first[0]), int(first[1]), int(wanted[0]), int(wanted[1])
-
-
-def _inserted(picture: Singles, window: Window, part: Singles, inner: Window) -> Singles:
-    """Replace a part of a picture (..., height, width) by that of a window within its own."""
-    out, x, y = picture.copy(), inner[0] - window[0], inner[1] - window[1]
-    out[..., y : y + inner[3], x : x + inner[2]] = part
-    return out
 
 
 def _shots_of_a_row(parts: Sequence[SubFrames]) -> int:
