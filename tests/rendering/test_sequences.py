@@ -104,6 +104,19 @@ def test_moments_are_at_most_half_a_pixel_apart_and_add_up_to_the_exposure():
     assert np.all(sum(part.labelled.astype(int) for part in parts if part.labelled is not None) == 1)
 
 
+def test_moments_share_lids_and_skin_without_a_change_of_the_picture(renderer):
+    """The same exposure, with every moment rendered whole and with lids of its own, differs less than blur may."""
+    picture_of = {"image": {"spp": 48, "window_px": [160, 120]}}
+    scene = in_time(sequence=turning(500.0, -5.0, 0.02), camera=SLOW_ROWS, **{**SMALL, **picture_of})
+    frames = scene.frames().take([1])
+    job = render_job(frames, 0)
+    shared = moments(frames, 0, job, render_job)
+    alone = [replace(p, moving=None, jobs=(replace(p.jobs[0], posed=None, region=job.region),)) for p in shared]
+    assert 1 < len({id(part.jobs[0].posed) for part in shared}) < len(shared)
+    light, whole = (renderer.render(job, spp=48, moments=parts).irradiance for parts in (shared, alone))
+    assert np.sqrt(np.mean((light - whole) ** 2)) < 0.005 * np.sqrt(np.mean(whole**2))
+
+
 def test_labels_of_a_blink_and_of_the_pupil_are_those_of_the_instant(renderer, tmp_path):
     keys = {"lids": {"blinks_per_minute": 0, "at_s": [0.0]}, "pupil": {"time_s": [0, 1], "mm": [3.0, 4.0]}}
     scene = in_time(sequence={**turning(0.0, 0.0, 0.05), **keys}, **SMALL)
