@@ -1,14 +1,16 @@
 """The study of appearance: does the complexity of an eye model matter to a network that learns gaze from pictures?
 
 The same people, with their looks, lids and pupils, are rendered with their own drawn eyes and with each eye model. A
-small network learns from each set of pictures, and is tested on other people in every set. People and seeds of the
-networks are crossed random factors: intervals draw both anew, the people and, independently of them, the seeds (the
-pigeonhole bootstrap of Owen 2007, Ann. Appl. Stat. 1(2), 386-411).
+small network learns from each set of pictures, and is tested on other people in every set. The test with drawn eyes, on
+which the answer rests, has as many people more. People and seeds of the networks are crossed random factors: intervals
+draw both anew, the people and, independently of them, the seeds (the pigeonhole bootstrap of Owen 2007, Ann. Appl.
+Stat. 1(2), 386-411).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...base.arrays import Floats
+from ...base.arrays import Bools, Floats
 from ...base.errors import InputError
 from ...base.processes import mapper, usable_cpus
 from ...base.progress import Progress, notify
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from .appearance_networks import NetworkErrors
 
 RECIPE = Path(__file__).with_name("appearance.yaml")
-DRAWN = "people"  # the name of the pictures with drawn eyes
+DRAWN, MORE = "people", "more people"  # names of the pictures with drawn eyes: those of all tests, and more of one test
 TOLERANCE_DEG = 0.3
 PILOT = 200  # people in the training below which a run is a pilot
 WHEN = ("before calibration", "after nine points")
@@ -61,41 +63,41 @@ class AppearanceStudy(Study):
             raise InputError(reason, source="appearance") from None
         folders = pictures(plan, progress)
         out: list[NetworkErrors] = []
-        notify(progress, 0, len(folders), "networks")
-        with mapper(min(plan.options.workers or usable_cpus(), len(folders))) as mapped:
-            for part in mapped(partial(errors_of_networks, folders, plan.options.seeds), folders):
+        names = [name for name in folders if name != MORE]
+        notify(progress, 0, len(names), "networks")
+        with mapper(min(plan.options.workers or usable_cpus(), len(names))) as mapped:
+            for part in mapped(partial(errors_of_networks, folders, plan.options.seeds), names):
                 out.append(part)
-                notify(progress, len(out), len(folders), f"networks, {part.trained_on}")
+                notify(progress, len(out), len(names), f"networks, {part.trained_on}")
         return out
 
     def report(self, parts: Sequence[NetworkErrors], protocols: Sequence[str]) -> StudyReport:
         """Compare the networks; compose summary, tables and page."""
+        parts = [replace(part, error_deg=joined(part.error_deg)) for part in parts]
         known = people_known(parts)
         rows = [
-            {"when": when, "trained_on": part.trained_on, "tested_on": tested, **interval(errors[k][:, known])}
+            {"when": when, "trained_on": part.trained_on, "tested_on": tested, **interval(errors[k][:, known[tested]])}
             for k, when in enumerate(WHEN)
             for part in parts
             for tested, errors in part.error_deg.items()
         ]
         pairs = [
             {"when": when, "one": one.trained_on, "other": other.trained_on, **difference(
-                (one.error_deg[DRAWN] - other.error_deg[DRAWN])[k][:, known])}
+                (one.error_deg[DRAWN] - other.error_deg[DRAWN])[k][:, known[DRAWN]])}
             for k, when in enumerate(WHEN)
             for other, one in combinations(parts, 2)
         ]  # fmt: skip
-        seeds, people = parts[0].error_deg[DRAWN].shape[1:]
         each = [
             (part.trained_on, tested, seed, person, *errors[:, seed, person].tolist())
             for part in parts
             for tested, errors in part.error_deg.items()
-            for seed in range(seeds)
-            for person in range(people)
+            for seed, person in np.ndindex(*errors.shape[1:])
         ]
         more = {
             "answer": answer(pairs),
             "pilot": parts[0].people < PILOT,
-            "seeds": seeds,
-            "people_tested": int(known.sum()),
+            "seeds": len(parts[0].error_deg[DRAWN][0]),
+            "people_tested": {name: int(rows.sum()) for name, rows in known.items()},
             "people_for_training": parts[0].people,
             "pictures_for_training": parts[0].pictures,
             "of_the_mean_deg": parts[0].of_the_mean_deg,
@@ -125,17 +127,30 @@ def pictures(plan: StudyPlan, progress: Progress | None = None) -> dict[str, Pat
     changes = PlanOptions(subjects=count, spp=options.spp)
     spec = Plan.load(RECIPE, count=count, changes=changes).spec
     spec = spec.replaced("--population", {"population": {"preset": preset}})
+    more = PlanOptions(subjects=count // 2, splits="test=1")
     run = RunOptions(workers=options.workers, backend=options.backend, threads=options.threads)
-    folders = {DRAWN: plan.folder / DRAWN, **{eye: plan.folder / Path(eye).stem for eye in plan.eyes}}
+    folders = {name: plan.folder / Path(name).stem for name in (DRAWN, MORE, *plan.eyes)}
     for name, folder in folders.items():
-        own = Plan.load(spec, eye=None if name == DRAWN else name)
+        if name == MORE:
+            own = Plan.load(spec, seed=spec.seed + 1, count=count // 2, changes=more)
+        else:
+            own = Plan.load(spec, eye=None if name == DRAWN else name)
         generate(own, folder, run, progress=progress)
     return folders
 
 
-def people_known(parts: Sequence[NetworkErrors]) -> Any:
-    """Return which people (n,) have errors from all networks on all pictures."""
-    return np.all([np.isfinite(e).all(axis=(0, 1)) for part in parts for e in part.error_deg.values()], axis=0)
+def joined(error_deg: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Add the errors on more people to those on people; (2, seeds, people) by the name of the test."""
+    more = {DRAWN: np.concatenate([error_deg[DRAWN], error_deg[MORE]], axis=2)}
+    return {name: more.get(name, errors) for name, errors in error_deg.items() if name != MORE}
+
+
+def people_known(parts: Sequence[NetworkErrors]) -> dict[str, Bools]:
+    """Return which people (n,) have errors from all networks, by the name of the test."""
+    return {
+        name: np.all([np.isfinite(part.error_deg[name]).all(axis=(0, 1)) for part in parts], axis=0)
+        for name in parts[0].error_deg
+    }
 
 
 def interval(values: Floats) -> dict[str, float]:
@@ -189,8 +204,8 @@ def answer(pairs: Sequence[Mapping[str, Any]]) -> str:
 def cards(rows: Sequence[Mapping[str, Any]], more: Mapping[str, Any]) -> list[Card]:
     """Return the errors on drawn people of the simplest model and of drawn people."""
     first = [Card(before, f"deg, trained on {name}, before calibration") for name, before, _ in on_people(rows)[:2]]
-    size = f"people tested, {more['people_for_training']} others in the training, {more['seeds']} networks each"
-    return [*first, Card(str(more["people_tested"]), size + (": a pilot" if more["pilot"] else ""))]
+    size = f"drawn people tested, {more['people_for_training']} others in the training, {more['seeds']} networks each"
+    return [*first, Card(str(more["people_tested"][DRAWN]), size + (": a pilot" if more["pilot"] else ""))]
 
 
 def sections(rows: Sequence[Mapping[str, Any]], more: Mapping[str, Any]) -> list[Section]:
