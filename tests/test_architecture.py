@@ -239,14 +239,14 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 98860,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 98930,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1200,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 17390,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 990,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2710,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2740,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 12040,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
-    "design": 4010,  # tolerances, lids that shade LEDs, blur, LEDs stuck on, for makers; eyes without bias, for fits
+    "dataset": 12050,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
+    "design": 4060,  # tolerances, lids that shade LEDs, blur, LEDs stuck on, for makers; eyes without bias, for fits
     "extraction": 6500,
     "eye": 4670,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1880,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
