@@ -135,6 +135,9 @@ def report(name: str, networks: list[GazeNetwork], data: Arrays) -> None:
     print(f"{name}: {len(people)} pictures of {len(np.unique(people))} people, {len(networks)} networks")
     for key in each[0]:
         mean, low, high = interval(np.mean([one[key] for one in each], axis=0), people)
+        if np.isnan(mean):
+            print(f"  {key:27s} none: no picture has it, or no eye has over {len(GRID)} with a known gaze")
+            continue
         seeds = " ".join(f"{interval(one[key], people)[0]:.3f}" for one in each)
         print(f"  {key:27s} {mean:7.3f}  ({low:.3f} to {high:.3f})  each: {seeds}")
 
