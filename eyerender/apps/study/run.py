@@ -35,6 +35,8 @@ STUDIES: Final = MappingProxyType(
         "conditions": "conditions_study:ConditionsStudy",
         "rigs": "rigs:RigsStudy",
         "pupil-size": "pupil_size:PupilSizeStudy",
+        "calibration": "calibration_study:CalibrationStudy",
+        "stereo": "stereo:StereoStudy",
     }
 )
 """Name of a study -> its class in this package."""
