@@ -21,7 +21,7 @@ def test_people_are_the_unit_and_an_experiment_has_its_interval():
     """Means and intervals by hand: the people's means are 1, 2 and 6 deg; Student's t of 2 degrees of freedom."""
     errors = {"a": [0.0, 2.0], "b": [2.0, 2.0], "c": [6.0, np.nan]}
     groups = {who: {("own", "analytic"): {"R1, H1": np.array(values)}} for who, values in errors.items()}
-    told = over_people.Measured.of(np.array([1.0, 2.0, 3.0]))
+    told = over_people.Experiment.of(np.array([1.0, 2.0, 3.0]))
     (row,) = over_people.people_rows(groups, {"H1": told})
     half = 4.302653 * np.std([1, 2, 6], ddof=1) / np.sqrt(3)
     assert row["mean_deg"] == pytest.approx(3.0)

@@ -28,7 +28,7 @@ Groups = Mapping[tuple[str, str], Mapping[str, Floats]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
+class Experiment:
     """What an experiment found: its mean, and the 95 % interval of it if people's own values were published."""
 
     mean_deg: float
@@ -36,12 +36,12 @@ class Measured:
     high_deg: float | None = None
 
     @classmethod
-    def of(cls, values: Floats) -> Measured:
+    def of(cls, values: Floats) -> Experiment:
         """Compute mean and interval from the values (n,) of its people."""
         return cls(**dict(zip(("mean_deg", "low_deg", "high_deg"), mean_interval(values), strict=True)))
 
 
-def people_rows(groups: Mapping[str, Groups], measured: Mapping[str, Measured]) -> list[dict[str, Any]]:
+def people_rows(groups: Mapping[str, Groups], measured: Mapping[str, Experiment]) -> list[dict[str, Any]]:
     """Summarise the errors of people: one row for each protocol, observer and condition.
 
     Args:

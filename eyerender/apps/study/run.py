@@ -36,6 +36,8 @@ STUDIES: Final = MappingProxyType(
         "rigs": "rigs:RigsStudy",
         "glasses": "glasses_study:GlassesStudy",
         "pupil-size": "pupil_size:PupilSizeStudy",
+        "calibration": "calibration_study:CalibrationStudy",
+        "stereo": "stereo:StereoStudy",
         "appearance": "appearance:AppearanceStudy",
     }
 )

@@ -38,7 +38,7 @@ from .literature import MODELS, VARIANTS
 from .observers_compared import compare_observers
 from .observing import Observing
 from .options import StudyOptions
-from .over_people import Groups, Measured, listed, people_rows
+from .over_people import Experiment, Groups, listed, people_rows
 from .page_parts import (
     Apart,
     budget_section,
@@ -233,7 +233,7 @@ class Study:
         found: Groups = part.errors
         return found
 
-    def measured(self) -> Mapping[str, Measured]:
+    def measured(self) -> Mapping[str, Experiment]:
         """Return what an experiment found, by condition; by default nothing."""
         return {}
 
