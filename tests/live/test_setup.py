@@ -127,7 +127,7 @@ def test_bad_input_names_the_key_and_changes_nothing(desk):
         (lambda: desk.with_light(7, intensity_mw_sr=1.0), "lights"),
         (lambda: desk.following(99), "fixation"),
         (lambda: desk.with_opening(1.5), "region.blink"),
-        (lambda: setup_of("head_mounted").with_opening(0.5), "region.blink"),
+        (lambda: setup_of("guestrin2006").with_opening(0.5), "region.blink"),
     ):
         with pytest.raises(InputError, match=path):
             change()

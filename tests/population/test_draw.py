@@ -9,6 +9,8 @@ import pytest
 
 import eyerender as er
 from eyerender.population.model import default_reference
+from eyerender.population.people import PopulationSpec
+from eyerender.region.anatomy import Skin
 
 PRESETS = ("adults", "emmetropic_adults", "myopes", "children", "elderly")
 
@@ -206,3 +208,20 @@ def test_lengths_radii_and_refractions_correlate_as_in_samples():
         values = {"ratio": length / radius, "length": length, "radius": radius}
         for name, (low, high) in pairs.items():
             assert low < np.asarray(np.corrcoef(values[name], refraction))[0, 1] < high, (preset, name)
+
+
+def test_the_history_of_skin_has_random_numbers_of_its_own():
+    aged, bare = (PopulationSpec(preset="adults", skin_history=h).numbers(400, 3) for h in (1.0, 0.0))
+    own = {"skin.folds", "skin.mottling", "skin.relief_mm", "skin.liner", "skin.shadow"}
+    assert all(np.array_equal(aged[name], bare[name]) for name in set(aged) - own)
+    assert not any(bare[name].any() for name in ("skin.folds", "skin.liner", "skin.shadow"))
+    skin = Skin()
+    assert np.all(bare["skin.mottling"] == skin.mottling)
+    assert np.all(bare["skin.relief_mm"] == skin.relief_mm)
+    assert np.corrcoef(aged["age_years"], aged["skin.folds"])[0, 1] > 0.5
+    made_up = aged["skin.liner"] > 0
+    assert not np.any(made_up & (aged["male"] > 0.5))
+    assert np.mean(made_up[aged["male"] < 0.5]) == pytest.approx(1 / 3, abs=0.09)
+    # A person's numbers depend on neither the number of people nor the first of them.
+    part = PopulationSpec(preset="adults").numbers(3, 3, first=7)
+    assert all(np.array_equal(part[name], aged[name][7:10]) for name in own)
