@@ -15,8 +15,10 @@ from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.population.marginals import Lognormal, Mixture, Normal, Part, Uniform
 from eyerender.population.model import Model, Reference, completed, default_reference, nearest_correlation
+from eyerender.population.people import PopulationSpec
 from eyerender.population.statistics import refusals, survey
 from eyerender.population.table import PopulationTable, default_table
+from eyerender.region.anatomy import Skin
 
 PRESETS = ("adults", "emmetropic_adults", "myopes", "children", "elderly")
 
@@ -387,3 +389,20 @@ def test_wrong_tables_name_the_key():
         )
     with pytest.raises(InputError, match="unknown quantity"):
         changed(presets__adults2={"description": "x", "replace": {"no": {"kind": "fixed", "value": 1.0}}})
+
+
+def test_the_history_of_skin_has_random_numbers_of_its_own():
+    aged, bare = (PopulationSpec(preset="adults", skin_history=h).numbers(400, 3) for h in (1.0, 0.0))
+    own = {"skin.folds", "skin.mottling", "skin.relief_mm", "skin.liner", "skin.shadow"}
+    assert all(np.array_equal(aged[name], bare[name]) for name in set(aged) - own)
+    assert not any(bare[name].any() for name in ("skin.folds", "skin.liner", "skin.shadow"))
+    skin = Skin()
+    assert np.all(bare["skin.mottling"] == skin.mottling)
+    assert np.all(bare["skin.relief_mm"] == skin.relief_mm)
+    assert np.corrcoef(aged["age_years"], aged["skin.folds"])[0, 1] > 0.5
+    made_up = aged["skin.liner"] > 0
+    assert not np.any(made_up & (aged["male"] > 0.5))
+    assert np.mean(made_up[aged["male"] < 0.5]) == pytest.approx(1 / 3, abs=0.09)
+    # A person's numbers depend on neither the number of people nor the first of them.
+    part = PopulationSpec(preset="adults").numbers(3, 3, first=7)
+    assert all(np.array_equal(part[name], aged[name][7:10]) for name in own)
