@@ -23,21 +23,21 @@ FLOORS = {
     "backends": 1,
     "optics": 1,
     "eye": 2,
-    "region": 2,
+    "region": 4240,
     "rig": 4580,  # devices of owners; frame rates, shutters and pulses, for those who synchronise cameras
-    "population": 2510,
+    "population": 2540,
     "scene": 4360,  # eyes, lids, pupils and rigs that move, for all who use sequences of frames
     "folders": 4,
     "analytic": 1150,  # eyes behind lenses; features at the time of their own rows, for owners of rolling shutters
     "rendering": 13190,
     "extraction": 5,
-    "design": 4010,
+    "design": 4060,
     "gaze": 7,
     "imaging": 3580,  # eyes of cameras; moments of exposures, traces and EyeLink's text, for laboratories
     "report": 9,
-    "dataset": 9,
+    "dataset": 11780,
     "torch": 10,
-    "apps": 18560,  # with studies of networks
+    "apps": 18890,  # with studies of networks
     "cli": 12,
     "__init__": 13,
     "__main__": 13,
@@ -239,7 +239,7 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 98620,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 99170,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1180,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 17210,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 970,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
