@@ -40,7 +40,7 @@ from own_labels import Label, labels, refuse
 from eyerender.base.errors import InputError
 from eyerender.dataset import find_dataset
 from eyerender.torch import Augment
-from eyerender.torch.gaze import NAMES, Arrays, GazeNetwork, angle_deg, answers, gaze_errors, read, trained
+from eyerender.torch.gaze import GRID, NAMES, Arrays, GazeNetwork, angle_deg, answers, gaze_errors, read, trained
 
 SIZE = 128  # width and height of the pictures that the network sees, px
 AUGMENT = Augment(flip=0.0, scale=(0.7, 1.5), roll_deg=20.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from eyerender.analytic.observer import trace
 from eyerender.apps.study import over_people, pupil_size
 from eyerender.apps.study.results import ModelResults
 from eyerender.apps.study.run import run_study
+from eyerender.apps.study.study import changed
 from eyerender.base.errors import InputError
+from eyerender.imaging.images import EyeImage
 from eyerender.optics.transforms import direction_of
 
 PERSON = {"preset": "adults", "seed": 0, "subject": 3}
@@ -63,7 +66,7 @@ def test_the_thresholded_area_of_a_disc_with_a_glint():
     y, x = np.indices((120, 160))
     counts = np.where(np.hypot(x - 80.3, y - 60.7) < 25.0, 20, 200)
     counts[55:60, 75:80] = 255
-    image = SimpleNamespace(counts=counts, window=np.array([10, 20, 160, 120]))
+    image = cast(EyeImage, SimpleNamespace(counts=counts, window=np.array([10, 20, 160, 120])))
     found = pupil_size.thresholded(image, 110.0, np.array([90.0, 81.0]))
     assert found == pytest.approx(25.0, rel=0.005)
     assert np.isnan(pupil_size.thresholded(image, 5.0, np.array([90.0, 81.0])))
@@ -77,7 +80,7 @@ def test_the_artefact_is_none_at_the_calibration_and_its_shift_follows_the_stop(
     assert np.abs(found["whole"][start]).max() < 1e-9
     for eye, side in enumerate(("right", "left")):
         ends = [
-            pupil_size.changed(scene, {"eye": {"pupil_diameter_mm": None}, "subject": {"luminance_cd_m2": one}})
+            changed(scene, {"eye": {"pupil_diameter_mm": None}, "subject": {"luminance_cd_m2": one}})
             for one in (pupil_size.LUMINANCES[0], pupil_size.LUMINANCES[-1])
         ]
         moved = np.subtract(*(one.eye(side).stop.centre_mm[1:] for one in ends))
