@@ -23,21 +23,21 @@ FLOORS = {
     "backends": 1,
     "optics": 1,
     "eye": 2,
-    "region": 4240,
-    "rig": 4580,  # devices of owners; frame rates, shutters and pulses, for those who synchronise cameras
-    "population": 2540,
-    "scene": 4360,  # eyes, lids, pupils and rigs that move, for all who use sequences of frames
+    "region": 2,
+    "rig": 2,  # devices of owners; frame rates, shutters and pulses, for those who synchronise cameras
+    "population": 3,
+    "scene": 3,  # eyes, lids, pupils and rigs that move, for all who use sequences of frames
     "folders": 4,
-    "analytic": 1150,  # eyes behind lenses; features at the time of their own rows, for owners of rolling shutters
-    "rendering": 13190,
+    "analytic": 5,  # eyes behind lenses; features at the time of their own rows, for owners of rolling shutters
+    "rendering": 5,
     "extraction": 5,
-    "design": 4060,
+    "design": 6,
     "gaze": 7,
-    "imaging": 3580,  # eyes of cameras; moments of exposures, traces and EyeLink's text, for laboratories
+    "imaging": 8,  # eyes of cameras; moments of exposures, traces and EyeLink's text, for laboratories
     "report": 9,
-    "dataset": 11780,
+    "dataset": 9,
     "torch": 10,
-    "apps": 18890,  # with studies of networks
+    "apps": 11,  # with studies of networks
     "cli": 12,
     "__init__": 13,
     "__main__": 13,
@@ -240,25 +240,25 @@ def lines_of(package: str = "") -> int:
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
     "": 99170,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
-    "analytic": 1180,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
-    "apps": 17210,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
+    "analytic": 1150,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
+    "apps": 18890,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 970,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2660,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2660,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
-    "dataset": 11770,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
-    "design": 3970,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
+    "dataset": 11780,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
+    "design": 4060,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 6030,
     "eye": 4450,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1840,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5310,  # tables of other trackers; intervals of budgets; precision, for laboratories
-    "imaging": 3480,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
+    "imaging": 3580,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
     "optics": 5070,
-    "population": 2500,  # children who become more myopic as they grow, for trackers of children
-    "region": 4110,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
-    "rendering": 13110,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
+    "population": 2540,  # children who become more myopic as they grow, for trackers of children
+    "region": 4240,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
+    "rendering": 13190,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
     "report": 970,
-    "rig": 4540,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
-    "scene": 4330,  # people, times and lens reflections in records; cameras past lenses; refusals where written
+    "rig": 4580,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
+    "scene": 4360,  # people, times and lens reflections in records; cameras past lenses; refusals where written
     "torch": 820,  # a small network for gaze, which an example and a study share, for trainers
 }
 

@@ -47,7 +47,7 @@ def test_the_dataset_says_exactly_what_the_study_observes(study):
             shot.scene
             for scene in scenes
             for kind in kinds
-            for shot in Observing(kind).shots(scene, facing=study.facing, spp=4)
+            for shot in Observing(kind=kind).shots(scene, facing=study.facing, spp=4)
         ]
 
     wanted, quiet = wanted_by("image"), wanted_by("image-noiseless")

@@ -14,7 +14,7 @@ from eyerender.apps.study.results import ModelResults
 from eyerender.apps.study.run import run_study
 from eyerender.apps.study.study import changed
 from eyerender.base.errors import InputError
-from eyerender.imaging.images import EyeImage
+from eyerender.imaging.capture import EyeImage
 from eyerender.optics.transforms import direction_of
 
 PERSON = {"preset": "adults", "seed": 0, "subject": 3}

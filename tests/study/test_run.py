@@ -253,7 +253,7 @@ def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
     scene = guestrin.scene("E1", guestrin.CORRECTED)
     # The image part alone is replaced by the analytic one: what is tested is the order and the index.
     monkeypatch.setattr(StudyImages, "observe", lambda self, s, noise_seed=None: trace(s))
-    seen = Observing("image", StudyImages({})).observe(scene, facing=True)
+    seen = Observing(kind="image", images=StudyImages({})).observe(scene, facing=True)
     direct = trace(scene)
     for name in ("frame", "fixation", "head", "eye", "target_mm"):
         np.testing.assert_array_equal(getattr(seen.index, name), getattr(direct.index, name))
@@ -263,9 +263,9 @@ def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
 def test_images_that_are_not_there_are_refused():
     scene = guestrin.scene("E1", set())
     with pytest.raises(InputError, match="needs images"):
-        Observing("image").observe(scene)
+        Observing(kind="image").observe(scene)
     with pytest.raises(InputError, match="not in the study's dataset"):
-        Observing("image", StudyImages({})).observe(scene)
+        Observing(kind="image", images=StudyImages({})).observe(scene)
 
 
 def test_known_feature_errors_and_paired_differences():

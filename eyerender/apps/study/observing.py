@@ -36,7 +36,7 @@ OUTLINE_POINTS = 64
 ObserverKind = Literal["analytic", "image", "image-noiseless"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Observing:
     """Observer of a study's scenes: ray optics, or images with or without the sensor's noise.
 

@@ -163,7 +163,7 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
         protocols=protocols,
         observer=observer,
         observings=tuple(
-            Observing(kind, spp=options.spp, backend=options.backend, threads=options.threads)
+            Observing(kind=kind, spp=options.spp, backend=options.backend, threads=options.threads)
             for kind in _kinds(observer, options.noise)
         ),
     )
