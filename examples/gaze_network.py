@@ -28,7 +28,6 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -37,20 +36,13 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 from own_labels import Label, labels, refuse
-from torch import nn
-from torch.nn import functional as F
-from torch.utils.data import ConcatDataset, DataLoader
 
 from eyerender.base.errors import InputError
 from eyerender.dataset import find_dataset
-from eyerender.rig.camera import PinholeCamera
-from eyerender.torch import Augment, FolderDataset
+from eyerender.torch import Augment
+from eyerender.torch.gaze import NAMES, Arrays, GazeNetwork, angle_deg, answers, gaze_errors, read, trained
 
 SIZE = 128  # width and height of the pictures that the network sees, px
-MAPS = 12  # heat maps, of which the first are those of POINTS
-POINTS = ("pupil", "iris", "outer corner", "upper lid", "inner corner", "lower lid")
-NAMES = ("pupil_ellipse", "confidence", "gaze", "pupil_mm", "lid_opening")
-PARTS = ("image", "pupil", "iris", "lids", "gaze", "gaze_deg", "centres_mm", "pupil_mm", "lid_opening", "camera")
 AUGMENT = Augment(flip=0.0, scale=(0.7, 1.5), roll_deg=20.0)
 MOVED = {  # people_two_cameras in another headset: the camera 3 mm and 5 deg aside, another lens, exposure and lamps
     "position_mm: [{var: forward}, ": "position_mm: [{var: forward + 2.1}, ",
@@ -61,121 +53,7 @@ MOVED = {  # people_two_cameras in another headset: the camera 3 mm and 5 deg as
     "exposure_ms: 2\n": "exposure_ms: 1.2\n",
     "position_mm: [17, ": "position_mm: [14, ",
 }
-GRID = np.array([(x, y) for y in (-15, 0, 15) for x in (-20, 0, 20)], dtype=float)  # of the calibration, deg
-Arrays = dict[str, torch.Tensor]
 Floats = NDArray[np.float64]
-
-
-def convolution(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Module:
-    """Create a convolution with a normalisation of its batch."""
-    layer = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
-    return nn.Sequential(layer, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
-
-
-class GazeNetwork(nn.Module):
-    """Heat maps of points of the eye, and what is read where they are.
-
-    The input is (n, 1, SIZE, SIZE), the levels of a picture as shares of the full scale. The outputs are those of
-    NAMES: the ellipse (n, 5) as x, y, a, b in px and the angle of a in rad from +x towards +y; the probability
-    (n, 1) that at least a tenth of the pupil shows; the line of sight (n, 3), a unit vector in the frame of a camera
-    that is turned to the pupil; the entrance pupil's diameter (n, 1), mm; the opening of the lids (n, 2), in mm and as
-    a share of that at rest. `points` gives the places of the heat maps (n, MAPS, 2), from -1 to 1.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.first = nn.Sequential(convolution(1, 16, 5, 2), convolution(16, 24, 3, 2), convolution(24, 32))
-        self.second = convolution(32, 48, 3, 2)
-        self.third = nn.Sequential(convolution(48, 48, 3, 2), convolution(48, 48))
-        self.across = nn.ModuleList(nn.Conv2d(width, 32, 1) for width in (32, 48, 48))
-        self.joined = convolution(32, 32)
-        self.maps = nn.Conv2d(32, MAPS, 1)
-        self.last = nn.Sequential(nn.Linear(2 * MAPS + 3 * 32 + 48, 64), nn.ReLU(inplace=True), nn.Linear(64, 11))
-        self.last[2].bias.data = torch.tensor([2.0, 0, 0, 0, 0, -1, 0, 4, 9, 1, 3])  # an eye as most are
-        axis = (torch.arange(SIZE // 4) + 0.5) * 8 / SIZE - 1
-        self.register_buffer("grid", torch.stack([axis.repeat(SIZE // 4), axis.repeat_interleave(SIZE // 4)], dim=-1))
-
-    def read(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the places of the heat maps (n, MAPS, 2), and the 11 numbers of the last layer."""
-        fine = self.first((image - 0.4) / 0.25)
-        middle = self.second(fine)
-        coarse = self.third(middle)
-        up = F.interpolate(self.across[2](coarse), scale_factor=2.0) + self.across[1](middle)
-        merged = self.joined(F.interpolate(up, scale_factor=2.0) + self.across[0](fine))
-        weights = self.maps(merged).flatten(2).softmax(-1)
-        points = weights @ self.grid
-        local = weights[:, :3] @ merged.flatten(2).transpose(1, 2)  # what is at the pupil, at the iris and elsewhere
-        beside = points[:, 1:] - points[:, :1]
-        seen = [points[:, :1].flatten(1), beside.flatten(1), local.flatten(1), coarse.mean((2, 3))]
-        return points, self.last(torch.cat(seen, dim=1))
-
-    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Compute what NAMES lists."""
-        points, found = self.read(image)
-        centre = (points[:, 0] + 1) * SIZE / 2 - 0.5
-        mean, even, odd = found[:, 0:1], found[:, 1:2], found[:, 2:3]
-        spread = (even**2 + odd**2 + 1e-9).sqrt()
-        angle = torch.atan(odd / (spread + even + 1e-9))  # half of that of (even, odd)
-        ellipse = torch.cat([centre, (mean + spread).exp(), (mean - spread).exp(), angle], dim=1)
-        gaze = found[:, 3:6] / (found[:, 3:6] ** 2).sum(1, keepdim=True).sqrt()
-        return ellipse, found[:, 6:7].sigmoid(), gaze, found[:, 7:8], found[:, 8:10]
-
-
-def turned(vectors: torch.Tensor, rays: torch.Tensor, back: bool = False) -> torch.Tensor:
-    """Turn vectors (n, 3) by the smallest rotations that bring rays (n, 3), unit vectors, to the camera's axis.
-
-    With `back`, turn the vectors by the opposite rotations.
-    """
-    x, y, z = rays.unbind(-1)
-    axis = torch.stack([y, -x, torch.zeros_like(x)], dim=-1) * (-1 if back else 1)
-    once = torch.linalg.cross(axis, vectors)
-    return vectors + once + torch.linalg.cross(axis, once) / (1 + z)[:, None]
-
-
-def read(folders: list[Path], split: str, augment: Augment | None = None, copies: int = 1) -> Arrays:
-    """Read pictures with their labels, each `copies` times with other random changes; pictures are stored as bytes."""
-    options: dict[str, Any] = {"parts": PARTS, "size": (SIZE, SIZE), "mirror_left": True, "augment": augment}
-    data: Any = ConcatDataset([FolderDataset(folder, split=split, **options) for folder in folders])
-    loader: DataLoader[Any] = DataLoader(data, batch_size=64)
-    return joined([upright(with_targets(batch)) for _ in range(copies) for batch in loader])
-
-
-def joined(batches: list[Arrays]) -> Arrays:
-    """Join batches."""
-    return {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]}
-
-
-def with_targets(batch: dict[str, Any]) -> Arrays:
-    """Bring the labels of a batch to the form that the network gives them; unknown ones are nan."""
-    valid, camera = batch["valid"], batch["camera"]
-    marks = batch["lids"][:, [0, 0, 0, 1], [0, 8, 16, 8]]
-    known = valid["lids"][:, [0, 0, 0, 1], [0, 8, 16, 8]]
-    points = torch.cat([batch["pupil"][:, None, :2], batch["iris"][:, None, :2], marks], dim=1)
-    known = torch.cat([valid["pupil"][:, None], valid["iris"][:, None], known], dim=1)
-    seen, (a, b, angle) = valid["pupil"], batch["pupil"][:, 2:].unbind(-1)
-    mean, spread = (a * b).log() / 2, (a / b).log() / 2
-    shape = torch.stack([mean, spread * (2 * angle).cos(), spread * (2 * angle).sin()], dim=-1)
-    rays = F.normalize(batch["centres_mm"][:, 2], dim=-1)
-
-    def masked(values: torch.Tensor, flags: torch.Tensor) -> torch.Tensor:
-        return values.float().where(flags.reshape(*flags.shape, *[1] * (values.ndim - flags.ndim)), torch.nan)
-
-    return {
-        "image": (batch["image"] * 255).round().byte(),
-        "points": masked((points + 0.5) * 2 / SIZE - 1, known & (points.abs() < 2 * SIZE).all(-1)),
-        "pupil": masked(batch["pupil"], seen),
-        "shape": masked(shape, seen),
-        "iris": masked(batch["iris"][:, 2:3].log(), valid["iris"][:, None]),
-        "gaze": masked(turned(batch["gaze"], rays), valid["gaze"]),
-        "camera_gaze": masked(batch["gaze"], valid["gaze"]),
-        "gaze_deg": masked(batch["gaze_deg"], valid["gaze"]),
-        "pupil_mm": masked(batch["pupil_mm"][:, :1], valid["pupil_mm"][:, :1]),
-        "opening": masked(batch["lid_opening"], valid["lid_opening"]),
-        "seen": seen.float()[:, None],
-        "subject": batch["subject"],
-        "left": batch["mirrored"],
-        **{key: camera[key] for key in ("K", "R", "distortion", "fisheye", "mirrored")},
-    }
 
 
 def upright(data: Arrays) -> Arrays:
@@ -211,128 +89,11 @@ def quarter(vectors: torch.Tensor) -> torch.Tensor:
     return torch.stack([vectors[..., 1], -vectors[..., 0], *vectors[..., 2:].unbind(-1)], dim=-1)
 
 
-def loss_of(network: GazeNetwork, batch: Arrays) -> torch.Tensor:
-    """Sum the mean errors of all outputs over the labels that are known."""
-    points, found = network.read(batch["image"].float() / 255)
-
-    def error(mine: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
-        known = true.isfinite()
-        return ((mine - true.nan_to_num()).abs() * known).sum() / known.sum().clamp(min=1)
-
-    gaze = F.normalize(found[:, 3:6], dim=-1)
-    apart = (gaze - batch["gaze"].nan_to_num()).norm(dim=-1)[batch["gaze"][:, 0].isfinite()].mean().nan_to_num()
-    return (
-        4 * error(points[:, : len(POINTS)], batch["points"])
-        + 4 * error(points[:, :1], batch["points"][:, :1])
-        + 2 * error(found[:, :3], batch["shape"])
-        + 4 * apart
-        + error(found[:, 7:8], batch["pupil_mm"])
-        + 0.1 * error(found[:, 8:9], batch["opening"][:, :1])
-        + error(found[:, 9:10], batch["opening"][:, 1:])
-        + error(found[:, 10:11], batch["iris"])  # gives the scale, and is no output
-        + 0.2 * F.binary_cross_entropy_with_logits(found[:, 6:7], batch["seen"])
-    )
-
-
-def trained(data: Arrays, epochs: int, seed: int) -> GazeNetwork:
-    """Train a network on pictures and labels."""
-    torch.manual_seed(seed)
-    network = GazeNetwork().to(memory_format=torch.channels_last)
-    count, batch = len(data["image"]), 48
-    optimiser = torch.optim.AdamW(network.parameters(), lr=4e-3, weight_decay=0.02)
-    steps = epochs * max(count // batch, 1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=steps)
-    for epoch in range(epochs):
-        network.train()
-        total, parts = 0.0, torch.randperm(count).split(batch)[: max(count // batch, 1)]
-        for rows in parts:
-            loss = loss_of(network, {key: values[rows] for key, values in data.items()})
-            optimiser.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 2.0)
-            optimiser.step()
-            schedule.step()
-            total += loss.item()
-        print(f"seed {seed}, epoch {epoch + 1:2d} of {epochs}: loss {total / len(parts):.4f}", flush=True)
-    return network.eval()
-
-
-def answers(network: nn.Module, data: Arrays) -> dict[str, Floats]:
-    """Run a network on pictures: the outputs by name, and the line of sight in the camera's frame."""
-    with torch.inference_mode():
-        parts = [network(image.float() / 255) for image in data["image"].split(64)]
-        found = dict(zip(NAMES, (torch.cat(part) for part in zip(*parts, strict=True)), strict=True))
-        rays = rays_of(data, found["pupil_ellipse"][:, :2])
-        found["camera_gaze"] = turned(found["gaze"], rays, back=True)
-    return {name: values.double().numpy() for name, values in found.items()}
-
-
-def rays_of(data: Arrays, pixels: torch.Tensor) -> torch.Tensor:
-    """Compute unit vectors (n, 3) from cameras through pixels (n, 2) of their pictures, in the cameras' frames."""
-    out = []
-    for K, k, fisheye, pixel in zip(data["K"], data["distortion"], data["fisheye"], pixels, strict=True):
-        camera = PinholeCamera.of(K, np.eye(3), np.zeros(3), (1, 1), k.numpy()[: 6 if fisheye else 8])
-        out.append(camera.rays(pixel.double().numpy()))
-    return torch.from_numpy(np.array(out)).float()
-
-
-def angle_deg(a: Floats, b: Floats) -> Floats:
-    """Compute the angles between vectors (..., 3), of which those of `a` have the length 1."""
-    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
-    return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=-1) / 2, 0, 1)))
-
-
 def direction(degrees: Floats) -> Floats:
     """Compute unit vectors (n, 3) from azimuth and elevation (n, 2) in degrees."""
     azimuth, elevation = np.radians(degrees).T
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
     return np.stack([x, y, np.sin(elevation)], axis=-1)
-
-
-def calibrated(found: Floats, true: Floats, rows: NDArray[np.int64]) -> Floats:
-    """Correct directions (n, 3) of one eye by an affine map of angles, fitted to some rows.
-
-    The map is drawn to a mere offset, as if each of four points more confirmed that angles need no stretching.
-    """
-    middle = true[rows].mean(axis=0)
-    frame = np.linalg.svd(np.outer(middle, middle))[0]  # its first axis is the middle, or its opposite
-    frame[:, 0] = middle / np.linalg.norm(middle)
-    mine, theirs = (vectors @ frame[:, 1:] for vectors in (found, true))
-    about, most = mine[rows].mean(axis=0), 4 * 0.25**2
-    own = mine[rows] - about
-    wanted = theirs[rows] - theirs[rows].mean(axis=0) - own
-    stretch = np.linalg.solve(own.T @ own + most * np.eye(2), own.T @ wanted)
-    flat = (mine - about) @ (np.eye(2) + stretch) + theirs[rows].mean(axis=0)
-    ahead = np.sqrt(np.clip(1 - (flat**2).sum(axis=1), 0, None))
-    out = flat @ frame[:, 1:].T + ahead[:, None] * frame[:, 0]
-    return out / np.linalg.norm(out, axis=1, keepdims=True)
-
-
-def nine(degrees: Floats) -> NDArray[np.int64]:
-    """Choose the rows of azimuth and elevation (n, 2) nearest to the points of GRID; none if they are too few."""
-    left, chosen = np.flatnonzero(np.isfinite(degrees[:, 0])), []
-    for point in GRID if len(left) > len(GRID) else ():
-        chosen.append(left[np.argmin(((degrees[left] - point) ** 2).sum(axis=1))])
-        left = left[left != chosen[-1]]
-    return np.array(chosen, dtype=int)
-
-
-def gaze_errors(found: dict[str, Floats], data: Arrays) -> tuple[Floats, Floats]:
-    """Compute the errors (n,) of the line of sight in degrees, before and after the calibration of each eye.
-
-    They are nan where the gaze is unknown, and for the frames of the calibration.
-    """
-    mine, true, degrees = found["camera_gaze"], *(data[key].double().numpy() for key in ("camera_gaze", "gaze_deg"))
-    before, after = (np.full(len(true), np.nan) for _ in range(2))
-    eyes = 2 * data["subject"] + data["left"]
-    for eye in eyes.unique():
-        rows = np.flatnonzero(eyes == eye)
-        used = nine(degrees[rows])
-        rest = np.setdiff1d(np.arange(len(rows)), used)
-        before[rows[rest]] = angle_deg(mine[rows], true[rows])[rest]
-        if len(used):
-            after[rows[rest]] = angle_deg(calibrated(mine[rows], true[rows], used), true[rows])[rest]
-    return before, after
 
 
 def errors_of(found: dict[str, Floats], data: Arrays) -> dict[str, Floats]:
@@ -455,6 +216,11 @@ def write_moved(path: Path) -> None:
     path.write_text(text, encoding="utf-8")
 
 
+def say(line: str) -> None:
+    """Print a line at once."""
+    print(line, flush=True)
+
+
 def main() -> int:
     """Train, test, report and export."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -476,12 +242,12 @@ def main() -> int:
     torch.manual_seed(0)
     start, cpu = time.monotonic(), time.process_time()
     try:
-        data = read(options.folders, "train", AUGMENT, options.copies)
-        tests = {folder: read([folder], "test") for folder in options.test}
+        data = upright(read(options.folders, "train", size=SIZE, augment=AUGMENT, copies=options.copies))
+        tests = {folder: upright(read([folder], "test", size=SIZE)) for folder in options.test}
         table = labels(options.ellipses) if options.pictures else []
     except InputError as error:
         refuse(str(error))
-    networks = [trained(data, options.epochs, seed) for seed in range(options.seeds)]
+    networks = [trained(data, options.epochs, seed, say) for seed in range(options.seeds)]
     print(f"{len(data['image'])} changed pictures; {sum(p.numel() for p in networks[0].parameters())} weights; "
           f"{time.monotonic() - start:.0f} s, {time.process_time() - cpu:.0f} s of processor time")  # fmt: skip
     if options.onnx is not None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from _bench import Report, Row, options_of, row, single_threaded
@@ -21,6 +21,7 @@ from _bench import Report, Row, options_of, row, single_threaded
 single_threaded()
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eyerender.base.arrays import Floats
 from eyerender.scene.sequence.course import MovingEyes
@@ -44,10 +45,10 @@ def moved(seed: int, duration_s: float, resting_mm: float = 4.0, **keys: Any) ->
     """Draw a sequence of person `seed`, and sample it at 1,000 Hz."""
     spec = Sequence.from_mapping({"seed": seed, "duration_s": duration_s, **STILL, **keys})
     course = MovingEyes.of(spec, aim, Habits.drawn((seed,)), np.full(2, resting_mm))
-    return course.at(np.arange(round(duration_s * 1000)) * 1e-3)
+    return course.at(1e-3 * np.arange(round(duration_s * 1000), dtype=float))
 
 
-def runs(flags: Floats) -> list[tuple[int, int]]:
+def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the first and the last plus one of each run of True."""
     edges = np.diff(np.concatenate([[0], np.asarray(flags, dtype=int), [0]]))
     return list(zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True))
@@ -75,7 +76,7 @@ def saccades(people: range) -> Iterator[Row]:
             rings.append(np.mean([shift[b : b + 100].max() for _, b in inner]))
         many = np.sqrt(len(people))
         off = 32.0 if size == 40.0 else None  # Collewijn et al.: 502 +- 32 deg/s
-        yield row(f"peak velocity at {size:g} deg: mean", np.mean(peaks), "deg/s")
+        yield row(f"peak velocity at {size:g} deg: mean", float(np.mean(peaks)), "deg/s")
         yield row(f"peak velocity at {size:g} deg: 95 % half width", 1.96 * np.std(peaks, ddof=1) / many, "deg/s")
         if off is not None:
             yield row("peak velocity at 40 deg: distance from 502", abs(np.mean(peaks) - 502.0), "deg/s", off)
@@ -87,17 +88,18 @@ def saccades(people: range) -> Iterator[Row]:
         yield row(f"oscillation after {size:g} deg: median", np.median(rings), "deg")
         if size == 10.0:
             ten = np.median(rings)
-            yield row("oscillation after 10 deg: share of people from 0.2 to 1 deg",
-                      np.mean((np.array(rings) >= 0.2) & (np.array(rings) <= 1.0)), "", 0.8, at_least=True)  # fmt: skip
+            share = float(np.mean((np.array(rings) >= 0.2) & (np.array(rings) <= 1.0)))
+            yield row("oscillation after 10 deg: share of people from 0.2 to 1 deg", share, "", 0.8, at_least=True)
         if size == 30.0:
             yield row("oscillation after 30 deg over that after 10 deg", np.median(rings) / ten, "", 1.0)
 
 
-def z(name: str, found: list[float], expected: float) -> Row:
+def z(name: str, found: Iterable[Any], expected: float) -> Row:
     """Compare the mean of people with its source: the distance in standard errors, at most 3."""
-    error = np.std(found, ddof=1) / np.sqrt(len(found))
-    text = f"z: {name} ({np.mean(found):.4g}, source {expected:.4g})"
-    return row(text, abs(np.mean(found) - expected) / error, "SE", 3.0)
+    values = np.array(list(found), dtype=float)
+    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    text = f"z: {name} ({np.mean(values):.4g}, source {expected:.4g})"
+    return row(text, abs(np.mean(values) - expected) / error, "SE", 3.0)
 
 
 def fixations(people: range) -> Iterator[Row]:

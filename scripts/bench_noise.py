@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +57,7 @@ def scene_of(name: str, seed: int, disc_px: float, speed_deg_s: float) -> er.Sce
     eye = scene.eye_position_mm(scene.spec.subject.eyes[0]) + np.array(scene.spec.subject.head_positions_mm[0])
     depth = float(camera.depth(eye - [PUPIL_DEPTH_MM, 0.0, 0.0]))
     strength = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
-    changes = {"look.iris_seed": seed, "lens.focus_mm": 1.0 / (1.0 / depth - disc_px / strength)}
+    changes: dict[str, Any] = {"look.iris_seed": seed, "lens.focus_mm": 1.0 / (1.0 / depth - disc_px / strength)}
     if speed_deg_s:
         changes["motion"] = {"eye_deg_s": [speed_deg_s, 0.0]}
     return scene.with_(changes)
@@ -88,14 +89,14 @@ def measured(scene: er.Scene, frame: int, draws: int) -> Measured:
     ]
     seen, exact, alone = er.ImageObserver(backend="llvm").observe_images(exposed), er.trace(frames), sensor_noise(scene)
     stated, points = extracted_noise(alone), exact.pupil.points_px[0]
-    bounds = (centre_bound(points, float(noise.outline_px[0])) for noise in (stated, alone))
+    centre, plain = (centre_bound(points, float(noise.outline_px[0])) for noise in (stated, alone))
     glints = []
     for k in range(len(scene.rig.lights)):
         there = seen.glints.ok & (seen.glints.light == k)
         if there.any(axis=1).mean() > 0.9:
-            noises = (float(noise.glint_px[0, k]) for noise in (stated, alone))
-            glints.append((scatter(seen.glints.xy_px[there]), *noises))
-    return Measured((scatter(seen.pupil.centre_px[seen.pupil.ok]), *bounds), glints, float(seen.pupil.ok.mean()))
+            found = scatter(seen.glints.xy_px[there])
+            glints.append((found, float(stated.glint_px[0, k]), float(alone.glint_px[0, k])))
+    return Measured((scatter(seen.pupil.centre_px[seen.pupil.ok]), centre, plain), glints, float(seen.pupil.ok.mean()))
 
 
 def main() -> int:

@@ -85,7 +85,7 @@ def detected(
             right, missed = (right + 1, missed) if hit is not None else (right, missed + 1)
             used |= set() if hit is None else {hit}
         rest = [pair for k, pair in enumerate(found) if k not in used]
-        wrong += sum(np.linalg.norm(gaze[min(y, len(gaze) - 1)] - gaze[x]) >= 1.0 for x, y in rest)
+        wrong += sum(int(np.linalg.norm(gaze[min(y, len(gaze) - 1)] - gaze[x]) >= 1.0) for x, y in rest)
     return 2 * right / (2 * right + wrong + missed)
 
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,6 +21,8 @@ from PIL import Image
 
 import eyerender as er
 from docs.tools import keys, references, validation
+from eyerender.scene import Scene
+from eyerender.scene.spec import SceneSpec
 from tests.support.paths import DATA, ROOT
 
 DOCS = ROOT / "docs"
@@ -64,10 +66,28 @@ def test_rows_state_unit_range_default_and_source():
 
 
 def test_a_record_is_described_once_and_links_lead_to_it(pages):
-    text = "".join(pages[f"generated/keys_{kind}"] for kind in keys.FILES)
-    anchors = re.findall(r"^\((keys-\w+)\)=$", text, re.MULTILINE)
-    assert len(anchors) == len(set(anchors)) > 40
-    assert set(re.findall(r"\(#(keys-\w+)\)", text)) <= set(anchors)
+    own = {page: re.findall(r"^\((keys-\w+)\)=$", pages[f"generated/{page}"], re.MULTILINE) for page in keys.BLOCKS}
+    everywhere = [name for names in own.values() for name in names]
+    assert len(everywhere) == len(set(everywhere)) > 90
+    for page in keys.BLOCKS:
+        for other, name in re.findall(r"\((?:(keys_\w+)\.md)?#(keys-\w+)\)", pages[f"generated/{page}"]):
+            assert name in own[other or page]
+
+
+@pytest.mark.parametrize("page", keys.BLOCKS)
+def test_the_example_of_a_page_of_keys_is_read(page):
+    block = keys.BLOCKS[page]
+    example = yaml.safe_load(block.example)
+    if "" not in block.paths:
+        whole = er.load_eye("E4").to_mapping() if block.kind == "eye" else er.load_scene("headset").spec.to_mapping()
+        if "sequence" in example:
+            del whole["targets"]
+        if "population" in example:
+            del whole["eye"], whole["region"]
+        example = {**whole, **example}
+    spec = keys.FILES[block.kind].from_mapping(example)
+    if block.kind == "scene":
+        assert len(Scene.of(cast(SceneSpec, spec)).frames()) > 0
 
 
 def test_every_public_name_has_a_docstring_page(pages):
@@ -78,16 +98,18 @@ def test_every_public_name_has_a_docstring_page(pages):
 
 
 def test_every_command_is_in_the_reference(pages):
-    text = pages["generated/commands"]
-    assert len(re.findall(r"^## eyerender ", text, re.MULTILINE)) > 15
-    assert "\neyerender render --output PATH [OPTIONS] SCENE\n" in text
+    texts = [pages[f"generated/{page}"] for page in references.COMMANDS]
+    assert len(re.findall(r"^## eyerender ", "".join(texts), re.MULTILINE)) > 25
+    assert all(text.count("**Examples**") == text.count("\n## eyerender ") for text in texts)
+    assert "\neyerender render --output PATH [OPTIONS] SCENE\n" in pages["generated/commands_scenes"]
 
 
 def test_every_page_is_in_a_table_of_contents(pages):
     listed = {"index", "generated/validation_tables", "generated/api_names"}  # the last two are included, no pages
     for text in pages.values():
         for body in re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL):
-            listed |= {line for line in body.splitlines() if line and not line.startswith(":")}
+            lines = (line for line in body.splitlines() if line and not line.startswith(":"))
+            listed |= {re.sub(r".*<(.+)>", r"\1", line).lstrip("/") for line in lines}
     assert set(pages) == listed - {GALLERY}
 
 

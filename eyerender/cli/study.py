@@ -33,7 +33,9 @@ def study(
         name: guestrin2006 (model-based gaze), blignaut2014 (interpolation-based gaze), observers (analytic against
             image-derived features on the head-mounted rig), conditions (analytic errors over the screen, head
             positions, pupil sizes and eye parameters), rigs (six known layouts over a population: for whom each fails
-            where, and the effect of each LED), or a study of your own as module:Class.
+            where, and the effect of each LED), glasses (what lenses do to features, loss and every estimator),
+            pupil-size (how measured size and gaze depend on the pupil), appearance (networks that learn gaze from
+            pictures of each eye model; the extra torch), or a study of your own as module:Class.
         eyes: Eye models separated by commas, as catalogue names or eye files (default: those of the study).
     """
     from ..apps.study.run import REPORT, load_study, run_study

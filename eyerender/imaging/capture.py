@@ -253,6 +253,10 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         lens=scene.spec.lens,
         ambient=scene.ambient,
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
+        purkinje=(
+            1,
+            *(order for order in scene.spec.image.purkinje if order in scene.eye_at(index, row).purkinje_orders),
+        ),
         interreflection=scene.spec.image.interreflection,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=int(seeds.generate_state(1, np.uint64)[0]),
@@ -292,6 +296,8 @@ def check_windows(scene: RenderableScene) -> None:
     """
     if scene.spec.image.surfaces == "mesh":
         scene.refuse_spectacles("meshes of the eye are rendered")
+    if scene.spec.image.purkinje:
+        scene.refuse_spectacles("further Purkinje images are rendered")
     if scene.rig.obstacles and scene.region is not None and scene.region.head is not None:
         raise InputError("are not drawn around head meshes so far", path="rig.obstacles")
     spp = scene.spec.image.spp

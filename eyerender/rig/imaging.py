@@ -31,6 +31,11 @@ class Picture(Spec):
     mesh_edge_mm: Annotated[float, Field(ge=0.02, le=2)] = Field(
         default=0.1, description="length of the triangles' edges, with `surfaces: mesh`"
     )
+    purkinje: tuple[Annotated[int, Field(ge=2, le=4)], ...] = Field(
+        default=(),
+        description="further mirror images of the lamps: 2 (back of the cornea), 3 and 4 (front and back of the lens), "
+        "where the eye has these surfaces",
+    )
     interreflection: bool = Field(
         default=True,
         description="whether surfaces send light to each other: iris and cornea, globe, lids, face and background; "
@@ -62,6 +67,12 @@ class Opening(Spec):
         default=4.0, description="standard deviation of the edge's blur (chosen)"
     )
     radiance_w_m2_sr: NonNegative = Field(default=0.0, description="radiance of the rim, within the camera's filter")
+    arcs_w_m2_sr: NonNegative = Field(
+        default=0.0,
+        description="radiance of the brightest arc on the rim beside that: edges of a lens and its mount, lit by "
+        "lamps, around a dark corner of the picture (shapes chosen)",
+    )
+    arcs_seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=1, description="selects the arcs")
 
 
 class Star(Spec):

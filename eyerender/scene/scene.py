@@ -512,6 +512,11 @@ class Scene:
         return self.spec.model_copy(update=placed)
 
     @property
+    def further_purkinje(self) -> tuple[int, ...]:
+        """Orders of the mirror images of the lamps that pictures show besides the glints."""
+        return self.spec.image.purkinje
+
+    @property
     def openings(self) -> tuple[Opening, ...]:
         """Openings through which the cameras look."""
         return self.spec.lens.openings

@@ -1,4 +1,4 @@
-"""Every layout of the table in docs/extractors.md, four images each, from the folder to the page at the command."""
+"""Every layout of the table in docs/extractor_bench.md, four images each, from the folder to the page."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def bench(folder, out):
 
 
 def test_every_layout_of_the_page_has_a_test():
-    page = (ROOT / "docs" / "extractors.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "extractor_bench.md").read_text(encoding="utf-8")
     rows = page.split("| folder | labels |\n|---|---|\n")[1].split("\n\n")[0].splitlines()
     assert [re.split(r" \| ", row)[0].removeprefix("| ") for row in rows] == [*FIXTURES, *WRITERS]
 

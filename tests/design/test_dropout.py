@@ -14,6 +14,7 @@ from eyerender.design.noise import sensor_noise
 from eyerender.design.unknowns import COUNT, Unknowns
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 CELLS = np.array([people.GRID * row + column for row in (0, 4, 8) for column in (0, 4, 8)])
 ANGLES = np.arange(8) * np.pi / 4
@@ -21,7 +22,7 @@ ANGLES = np.arange(8) * np.pi / 4
 
 def ring_scene():
     """A camera of 100 degrees below the eye, at the temple, and eight LEDs on a ring of 22 mm, 16 mm in front of it."""
-    data = er.load_scene("head_mounted").spec.to_mapping()
+    data = er.load_scene(BARE_HEAD_MOUNTED).spec.to_mapping()
     data["rig"] = {
         "cameras": [
             {"position_mm": [18, -53.5, -14], "look_at_mm": [0, -31.5, 0], "focal_length_px": 168,
@@ -113,7 +114,7 @@ def test_a_lash_covers_its_strip_of_a_pencil():
 
 def test_blur_and_motion_make_features_noisier():
     """The noise of an edge with a blur b grows as sqrt(b), equation (1); a disc has the variance c^2 / 16."""
-    scene = er.load_scene("head_mounted")
+    scene = er.load_scene(BARE_HEAD_MOUNTED)
     sharp = sensor_noise(scene)
     camera = scene.rig.cameras[0]
     depth = float(camera.R[2] @ np.array([0.0, -31.5, 0.0]) + camera.t[2])

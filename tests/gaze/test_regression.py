@@ -21,6 +21,7 @@ from eyerender.gaze.validation import gaze_errors, leave_one_target_out
 from eyerender.optics.transforms import direction_of
 from eyerender.scene import load_scene
 from eyerender.scene.observation import Observations
+from tests.support.paths import BARE_HEAD_MOUNTED
 from tests.support.regression import RIG, synthetic
 
 
@@ -156,7 +157,7 @@ def targets_mm(depths=DEPTHS_MM):
 @pytest.fixture(scope="module")
 def head_mounted():
     """Scene, observations and rows of the calibration: a frontal camera sees all six glints in every direction."""
-    scene = load_scene("head_mounted")
+    scene = load_scene(BARE_HEAD_MOUNTED)
     scene = scene.with_(target_mm=targets_mm())
     assert scene.rig.screen is None
     seen = er.trace(scene)
@@ -276,6 +277,6 @@ def test_records_without_places_have_no_directions():
     seen = Observations.from_records(
         [{"schema": "eyerender/record/3", "eye": "right", "target_mm": [900, 0, 0], "pupil": {"centre_px": [1, 2]}}]
     )
-    rig = load_scene("head_mounted").rig
+    rig = load_scene(BARE_HEAD_MOUNTED).rig
     with pytest.raises(InputError, match="needs the places of the eyes"):
         er.gaze.DirectionRegression("R3", "pupil").fit(seen, rig)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ from eyerender.rendering.records.job import SubFrames
 from eyerender.scene.observation import EYES
 from tests.support.sequences import in_time, turning
 
-SMALL = {"image": {"spp": 2, "window_px": [160, 120]}, "sensor": {"noise": False, "exposure_ms": 4.0}}
-SLOW_ROWS = {"shutter": {"rolling": {"row_us": 20.0}}}
+SMALL: dict[str, Any] = {"image": {"spp": 2, "window_px": [160, 120]}, "sensor": {"noise": False, "exposure_ms": 4.0}}
+SLOW_ROWS: dict[str, Any] = {"shutter": {"rolling": {"row_us": 20.0}}}
 
 
 def picture(scene, row, renderer):
@@ -50,7 +51,7 @@ def test_a_pulse_bands_a_rolling_shutter_as_the_overlap_says(renderer):
 
 def test_rows_of_a_rolling_shutter_show_the_eye_at_their_own_time(renderer):
     """The middle of the pupil in each row of the mask is where the eye was when the row was exposed."""
-    short = {**SMALL, "sensor": {"noise": False, "exposure_ms": 1.0}}
+    short: dict[str, Any] = {**SMALL, "sensor": {"noise": False, "exposure_ms": 1.0}}
     scene = in_time(sequence=turning(400.0, -2.0, 0.03), camera=SLOW_ROWS, **short)
     image, timing = picture(scene, 0, renderer), scene.timings[0]
     frames = scene.frames()
@@ -149,7 +150,7 @@ def test_fields_of_an_interlaced_camera_show_the_eye_one_after_the_other(rendere
     """Even rows are those of a sharp picture at the first field's exposure, odd rows of one at the second's."""
     delayed = {"shutter": {"interlaced": {"delay_ms": 5.0}}, "frame_rate_hz": 50.0}
     picture_of = {"spp": 32, "window_px": [160, 120]}
-    short = {"image": picture_of, "sensor": {"noise": False, "exposure_ms": 0.2}, "region": None}
+    short: dict[str, Any] = {"image": picture_of, "sensor": {"noise": False, "exposure_ms": 0.2}, "region": None}
     scene = in_time(sequence=turning(200.0, -2.0, 0.04), camera=delayed, **short)
     both, frames = picture(scene, 0, renderer), scene.frames()
     assert frames.index.time_s[0] == pytest.approx(2.6e-3)  # midway between the fields

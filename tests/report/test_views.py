@@ -77,26 +77,27 @@ def test_printed_eye_loads_back_as_the_same_eye(tmp_path, capsys):
 
 
 def test_purkinje_images_on_demand(capsys):
-    assert run(["features", "quickstart", "--eye", "E4", "--purkinje", "2", "3", "4", "--json", "-"]) == 0
+    assert run(["features", "quickstart", "--eye", "E4", "--purkinje", "1", "2", "3", "4", "--json", "-"]) == 0
     data = json.loads(capsys.readouterr().out)
-    seen = {(p["frame"], p["eye"], p["image"]) for p in data["purkinje"]}
-    assert seen == {(r["frame"], r["eye"], k) for r in data["records"] for k in (1, 2, 3, 4)}
-    lost = [p for p in data["purkinje"] if p["status"] != "ok"]
+    assert "purkinje" not in data
+    images = [p | {"eye": r["eye"]} for r in data["records"] for p in r["purkinje"]]
+    assert all([p["order"] for p in r["purkinje"]] == [1, 2, 3, 4] for r in data["records"])  # one lamp
+    lost = [p for p in images if p["status"] != "ok"]
     # Seen 11 to 36 degrees beside the axis, the lens' front, which flattens outwards, has its image outside the pupil,
     # or none; the other images are there.
-    assert {p["image"] for p in lost} == {3}
+    assert {p["order"] for p in lost} == {3}
     assert {p["reason"] for p in lost} == {
         "behind the iris",
         "no point of the surface mirrors the light to the viewpoint",
     }
-    assert all(p["reason"] is None and p["in_image"] for p in data["purkinje"] if p["status"] == "ok")
-    data["purkinje"] = [p for p in data["purkinje"] if p["status"] == "ok"]
-    first = [p for p in data["purkinje"] if p["image"] == 1]
+    assert all(p["reason"] is None and p["in_image"] for p in images if p["status"] == "ok")
+    images = [p for p in images if p["status"] == "ok"]
+    first = [p for p in images if p["order"] == 1]
     assert [p["xy_px"] for p in first] == [r["glints"][0]["xy_px"] for r in data["records"]]
     assert len(data["non_ellipticity_px"]) == 18
     assert 0 < max(data["non_ellipticity_px"]) < 0.05  # of an apparent pupil of 13 px
     # The image in the back of the lens is inverted: it moves against the glint as the eye turns.
-    fourth = np.array([p["xy_px"] for p in data["purkinje"] if p["image"] == 4 and p["eye"] == "right"])
+    fourth = np.array([p["xy_px"] for p in images if p["order"] == 4 and p["eye"] == "right"])
     glint = np.array([p["xy_px"] for p in first if p["eye"] == "right"])
     pupil = np.array([r["pupil"]["centre_px"] for r in data["records"] if r["eye"] == "right"])
     a, b = glint - pupil, fourth - pupil

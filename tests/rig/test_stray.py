@@ -207,6 +207,21 @@ def test_the_rim_shows_its_own_radiance(picture):
     assert out[120, 160] == pytest.approx(picture[120, 160])
 
 
+def test_arcs_of_light_lie_on_the_rim_alone_and_belong_to_the_sensor(picture):
+    opening = Opening(half_size=(0.7, 0.5), edge_px=0, arcs_w_m2_sr=2.0, arcs_seed=3)
+    out = framed(picture, Lens(openings=(opening,)), CAMERA, WHOLE)
+    rim = transmission(opening, CAMERA, WHOLE) == 0
+    assert np.array_equal(out[~rim], picture[~rim])
+    assert out[rim].max() <= 0.002 * (1 + 1e-6)
+    assert np.ptp(out[rim]) > 0.0002
+    # A window shows its part of the same arcs, another seed others.
+    part = framed(picture[:, 120:], Lens(openings=(opening,)), CAMERA, (120, 0, 200, 240))
+    other = framed(picture, Lens(openings=(opening.model_copy(update={"arcs_seed": 4}),)), CAMERA, WHOLE)
+    assert np.array_equal(part, out[:, 120:])
+    assert np.ptp(part[rim[:, 120:]]) > 0.0002
+    assert np.abs(other - out)[rim].max() > 0.0002
+
+
 def test_what_is_covered():
     assert covered(Lens(), Sensor(), CAMERA, WHOLE) is None
     sensor = Sensor(border_px=(3, 0, 5, 20))

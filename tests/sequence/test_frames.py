@@ -47,8 +47,8 @@ def test_each_feature_under_a_rolling_shutter_is_seen_when_its_row_is_exposed():
     for light in np.flatnonzero(seen.glints.ok[row]).tolist():
         own = float(timing.ambient_s(frames.index.start_s[row], seen.glints.xy_px[row, light, 1]))
         assert seen.glints.time_s[row, light] == pytest.approx(own, abs=1e-12)
-        there = trace(frames.at([row], np.array([own])))
-        np.testing.assert_allclose(there.glints.xy_px[0, light], seen.glints.xy_px[row, light], atol=1e-9)
+        again = trace(frames.at([row], np.array([own])))
+        np.testing.assert_allclose(again.glints.xy_px[0, light], seen.glints.xy_px[row, light], atol=1e-9)
     assert seen.pupil.time_s[row] != frames.index.time_s[row]
 
 

@@ -11,7 +11,7 @@ from eyerender.scene.sequence.course import MovingEyes
 from eyerender.scene.sequence.habits import Habits
 from eyerender.scene.sequence.spec import Sequence
 
-TIMES = np.arange(20_000) * 1e-3
+TIMES = 1e-3 * np.arange(20_000, dtype=float)
 
 
 def aim(targets_mm, head_mm, eye):
@@ -69,7 +69,7 @@ def test_the_oscillation_solves_its_equation():
 
 def test_oscillation_displaces_gaze_by_a_fraction_of_a_degree_and_falls_with_the_size_of_saccades():
     """0.2 to 1 degree at 10 degrees (12 degrees of gaze per mm of the pupil), less at 30."""
-    peaks = {10.0: [], 30.0: []}
+    peaks: dict[float, list[float]] = {10.0: [], 30.0: []}
     for person in range(24):
         habits = Habits.drawn((person,))
         for amplitude, found in peaks.items():

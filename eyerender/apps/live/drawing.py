@@ -13,14 +13,14 @@ from ...eye.model import EyeModel
 from ...imaging.moments import eye_motion
 from ...optics.triangles import sharp_edges
 from ...region.limbus import lower
-from ...report.style import ANALYTIC, IMAGE, TARGET
+from ...report.style import ANALYTIC, CAMERA, IMAGE, TARGET
 from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 
 LIGHT, SIGHT, SCREEN, GLOBE, LIMBUS = "#E69F00", "#CC79A7", "#7A7A7A", "#B9B9B9", "#8A6D4B"
-CAMERA, AXIS, OBSTACLE = "#5B3A8C", "#009E73", "#555555"
+AXIS, OBSTACLE = "#009E73", "#555555"
 PUPIL = "#1c1c1c"
 LEGEND = (
     ("camera and its window", CAMERA),

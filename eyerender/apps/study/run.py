@@ -34,12 +34,16 @@ STUDIES: Final = MappingProxyType(
         "observers": "head_mounted:ObserversStudy",
         "conditions": "conditions_study:ConditionsStudy",
         "rigs": "rigs:RigsStudy",
+        "glasses": "glasses_study:GlassesStudy",
+        "pupil-size": "pupil_size:PupilSizeStudy",
+        "appearance": "appearance:AppearanceStudy",
     }
 )
 """Name of a study -> its class in this package."""
 RUN_SCHEMA = "eyerender/study/1"
 MARKER, REPORT, IMAGES = "study.json", "report.html", "images"
 PEOPLE_SEED = 0
+IMAGE_OBSERVERS = ("image", "both")
 
 
 def run_study(
@@ -60,8 +64,8 @@ def run_study(
     >>> er.apps.run_study("conditions", "out/conditions", eyes=["E2"])  # doctest: +SKIP
 
     Args:
-        study: guestrin2006, blignaut2014, observers, conditions or rigs; or your own: a subclass of `Study`, or its
-            name as `module:Class`.
+        study: the name of one of the package, as in `eyerender study --help`; or your own: a subclass of `Study`, or
+            its name as `module:Class`.
         folder: the folder for the results.
         options: protocol, observer, workers and the like.
         eyes: eye models (catalogue names or files; default: those of the study, or none if people are asked for).
@@ -78,13 +82,13 @@ def run_study(
     """
     name = study if isinstance(study, str) else f"{study.__module__}:{study.__qualname__}"
     chosen = load_study(name) if isinstance(study, str) else study()
-    plan = planned(chosen, name, replace(options, **changes), eyes)
-    settings = _settings(name, plan)
     folder = Path(folder)
+    plan = replace(planned(chosen, name, replace(options, **changes), eyes), folder=folder / IMAGES)
+    settings = _settings(name, plan)
     with _claimed(folder, settings, plan.options.overwrite):
         start = time.monotonic()
         with mistakes_of(name) if isinstance(study, str) else nullcontext():
-            plan = _with_images(chosen, name, plan, folder / IMAGES, progress, say)
+            plan = _with_images(chosen, name, plan, progress, say)
             report = chosen.report(chosen.parts(plan, progress), plan.protocols)
         seconds = round(time.monotonic() - start, 2)
         summary = write_results(folder, name, {"settings": settings, "seconds": seconds}, report)
@@ -146,8 +150,8 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
     if observer not in study.observers:
         known = " or ".join(map(repr, study.observers))
         raise InputError(f"the study {name!r} needs {known}, not {observer!r}", source="--observer")
-    if count and observer != "analytic":
-        raise InputError("people are observed by ray optics only", source="--observer")
+    if options.image_people is not None and not (count and observer in IMAGE_OBSERVERS):
+        raise InputError("needs people and an observer of images", source="--image-people")
     preset = Population(options.population or study.population or "adults").preset
     protocols = (options.protocol,) if options.protocol in study.protocols else tuple(study.protocols)
     return StudyPlan(
@@ -156,7 +160,10 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
         people=tuple({"preset": preset, "seed": PEOPLE_SEED, "subject": k} for k in range(count)),
         protocols=protocols,
         observer=observer,
-        observings=tuple(Observing(kind) for kind in _kinds(observer, options.noise)),
+        observings=tuple(
+            Observing(kind, spp=options.spp, backend=options.backend, threads=options.threads)
+            for kind in _kinds(observer, options.noise)
+        ),
     )
 
 
@@ -182,17 +189,15 @@ def _settings(name: str, plan: StudyPlan) -> dict[str, Any]:
     }
     if plan.people:
         settings |= {"population": plan.people[0]["preset"], "people": len(plan.people)}
-    if plan.observer != "analytic":
+    if plan.observer in IMAGE_OBSERVERS:
         settings |= {"spp": options.spp, "sensor_noise": options.noise, "noise_seeds": options.noise_seeds}
     return settings | _exposure(options.auto_exposure, plan.observer)
 
 
-def _with_images(
-    study: Study, name: str, plan: StudyPlan, folder: Path, progress: Progress | None, say: Say | None
-) -> StudyPlan:
+def _with_images(study: Study, name: str, plan: StudyPlan, progress: Progress | None, say: Say | None) -> StudyPlan:
     """Make the images that a plan needs, and give them to its observers."""
     kinds = [one.kind for one in plan.observings]
-    if kinds == ["analytic"]:
+    if not {"image", "image-noiseless"} & set(kinds) or not plan.eyes:
         return plan
     scenes = []
     for eye in plan.eyes:
@@ -201,7 +206,7 @@ def _with_images(
             shot.scene for scene in own for one in plan.observings
             for shot in one.shots(scene, facing=study.facing, spp=plan.options.spp)
         ]  # fmt: skip
-    images = make_images(name, scenes, folder, plan.options, _noted(progress), say)
+    images = make_images(name, scenes, plan.folder, plan.options, _noted(progress), say)
     # The noise term, which needs images with and without noise, is the mean of several exposures.
     seeds = {"image-noiseless": plan.options.noise_seeds} if "image" in kinds else {}
     observings = tuple(
@@ -215,8 +220,8 @@ def _exposure(level: float | None, observer: str) -> dict[str, float]:
     """Check the setting of the automatic exposure, if there is one."""
     if level is None:
         return {}
-    if observer == "analytic":
-        raise InputError("the analytic observer takes no images", source="--auto-exposure")
+    if observer not in IMAGE_OBSERVERS:
+        raise InputError(f"the {observer} observer takes no images", source="--auto-exposure")
     if not 0.01 <= level <= 2:
         raise InputError("must be 0.01 to 2", source="--auto-exposure")
     return {"auto_exposure": level}
@@ -225,9 +230,9 @@ def _exposure(level: float | None, observer: str) -> dict[str, float]:
 def _kinds(observer: str, noise: str) -> list[ObserverKind]:
     """Return the observers of a run."""
     kinds: list[ObserverKind] = []
-    if observer != "image":
+    if observer in ("analytic", "both"):
         kinds.append("analytic")
-    if observer != "analytic":
+    if observer in IMAGE_OBSERVERS:
         kinds += [kind for kind, without in (("image", "off"), ("image-noiseless", "on")) if noise != without]  # type: ignore[misc]
     return kinds
 

@@ -15,8 +15,9 @@ of the run. Methods add findings and sections, or replace what is observed and e
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -37,6 +38,7 @@ from .literature import MODELS, VARIANTS
 from .observers_compared import compare_observers
 from .observing import Observing
 from .options import StudyOptions
+from .over_people import Groups, Measured, listed, people_rows
 from .page_parts import (
     Apart,
     budget_section,
@@ -54,7 +56,10 @@ _PUPIL_MM = 4.0  # diameter of a person's pupil where the scene states none
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyPlan:
-    """What a run of a study observes; `people` are choices of a population (preset, seed, subject)."""
+    """What a run of a study observes; `people` are choices of a population (preset, seed, subject).
+
+    `folder` is for the pictures of the run.
+    """
 
     options: StudyOptions
     eyes: tuple[str, ...]
@@ -62,6 +67,7 @@ class StudyPlan:
     protocols: tuple[str, ...]
     observer: str
     observings: tuple[Observing, ...]
+    folder: Path = Path()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +144,11 @@ class Study:
         for observing in plan.observings:
             shared: dict[str, Any] = {"protocols": plan.protocols, "observing": observing}
             out += [StudyJob(who=eye, **shared) for eye in plan.eyes]
-            out += [StudyJob(who=name_of(person), person=person, **shared) for person in plan.people]
+            if observing.kind != "analytic":
+                # Images of people are not kept: they are rendered within the job.
+                shared["observing"] = replace(observing, images=None, noise_seeds=0)
+            some = plan.people[: plan.options.image_people if observing.kind != "analytic" else None]
+            out += [StudyJob(who=name_of(person), person=person, **shared) for person in some]
         return out
 
     def parts(self, plan: StudyPlan, progress: Progress | None = None) -> Sequence[Any]:
@@ -218,6 +228,23 @@ class Study:
         """Return what the summary holds besides rows, error budget and observers."""
         return {}
 
+    def groups(self, part: Any) -> Groups:
+        """Return a person's errors by condition, for the results over people; by default those of the estimators."""
+        found: Groups = part.errors
+        return found
+
+    def measured(self) -> Mapping[str, Measured]:
+        """Return what an experiment found, by condition; by default nothing."""
+        return {}
+
+    def tables(self, parts: Sequence[Any]) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+        """Return tables for summary, page and CSV files: by default what was found over people."""
+        by: dict[str, dict[tuple[str, str], Any]] = {}
+        for part in parts:
+            if part.person is not None:
+                by.setdefault(part.eye_model, {}).update(self.groups(part))
+        return {"people": people_rows(by, self.measured())} if by else {}
+
     def cards(self, parts: Sequence[Any], apart: Apart) -> Sequence[Card]:
         """Return the page's first numbers; `apart` compares the observers."""
         out = []
@@ -259,18 +286,20 @@ class Study:
         apart = compare_observers(parts)
         made_of = budgets([p for p in parts if p.person is None and p.eye_model not in VARIANTS])
         found, faults = self.findings(parts), self.errata(parts)
+        listing = {name: rows for name, rows in self.tables(parts).items() if rows}
         steps: list[WaterfallStep] = [step for part in parts for step in part.waterfall]
         shown = tuple(self.shown) or tuple(dict.fromkeys(b.estimator for b in made_of))[:4]
         sections = [
             budget_section(made_of, shown, self.method),
             *self.sections(parts),
+            *(listed(name, rows) for name, rows in listing.items()),
             observers_section(apart, shown),
             findings_section(found) if found else None,
             waterfall_section(steps, self.departures, self.measures),
             errata_section(self.departures, faults) if self.departures else None,
         ]
         features, gaze = apart
-        more = self.more(parts, protocols)
+        more = self.more(parts, protocols) | listing
         more |= {"error_budget": [{**asdict(b), "terms": list(map(asdict, b.terms))} for b in made_of]}
         if self.departures:
             more |= {name: list(map(asdict, some)) for name, some in
@@ -283,7 +312,8 @@ class Study:
             rows=[row for part in parts for row in part.rows],
             findings=found,
             more=more,
-            tables={"waterfall.csv": (header, lines)} if self.departures else {},
+            tables=({"waterfall.csv": (header, lines)} if self.departures else {})
+            | {f"{name}.csv": (list(rows[0]), [list(row.values()) for row in rows]) for name, rows in listing.items()},
             page=Page(self.title, self.about, self.cards(parts, apart), sections),
         )
 

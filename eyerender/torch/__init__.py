@@ -28,20 +28,20 @@ import torch.distributed
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, WeightedRandomSampler, get_worker_info
 
-from .backends.choose import BackendChoice
-from .base.errors import InputError
-from .base.processes import spawning, usable_cpus
-from .dataset.plan import Plan
-from .dataset.realise import frames_of, realise
-from .dataset.spec import DatasetSpec, GeometryKind
-from .dataset.training.augment import Augmentation
-from .dataset.training.clips import Clips
-from .dataset.training.item import PARTS, PICTURES, TrainingItem, person_names
-from .dataset.training.prepare import Preparation, lamps_vary
-from .folders.imagefolder import KINDS, ImageFolder
+from ..backends.choose import BackendChoice
+from ..base.errors import InputError
+from ..base.processes import spawning, usable_cpus
+from ..dataset.plan import Plan
+from ..dataset.realise import frames_of, realise
+from ..dataset.spec import DatasetSpec, GeometryKind
+from ..dataset.training.augment import Augmentation
+from ..dataset.training.clips import Clips
+from ..dataset.training.item import PARTS, PICTURES, TrainingItem, person_names
+from ..dataset.training.prepare import Preparation, lamps_vary
+from ..folders.imagefolder import KINDS, ImageFolder
 
 if TYPE_CHECKING:
-    from .dataset.maker import Maker
+    from ..dataset.maker import Maker
 
 Parts = Mapping[str, Any]
 Transform = Callable[[dict[str, Any]], Any]
@@ -459,7 +459,7 @@ class StreamDataset(IterableDataset[Any]):
         """Render a batch: items with their lines and numbers; `sizes` are the numbers of lanes and of workers."""
         lanes, workers = sizes
         if self._maker is None:
-            from .dataset.maker import Maker
+            from ..dataset.maker import Maker
 
             threads = self.threads or max(1, usable_cpus() // workers)
             self._maker = Maker(self.plan, self.frames, backend=self.backend, threads=threads)
