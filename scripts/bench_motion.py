@@ -34,7 +34,7 @@ STILL = {"lids": {"blinks_per_minute": 0}, "pupil": {"hippus": 0}}
 ALONE = {"drift_arcmin2_s": 0, "microsaccades_per_s": 0}
 
 
-def aim(targets_mm: Floats, head_mm: Floats, eye: int) -> tuple[Floats, Floats]:
+def aim(targets_mm: Floats, head_mm: Floats, _torsion_rad: Floats, eye: int) -> tuple[Floats, Floats]:
     """Turn an eye at the side of the origin, whose line of sight is its axis."""
     gap = targets_mm - head_mm - np.array([0.0, 31.5 if eye else -31.5, 0.0])
     return np.arctan2(gap[:, 1], gap[:, 0]), np.arctan2(gap[:, 2], np.hypot(gap[:, 0], gap[:, 1]))
