@@ -72,8 +72,9 @@ class Answers:
 
 
 def image_key(image: BenchImage) -> str:
-    """Compute the SHA-256 of everything that an extractor receives: the file's bytes, the bit depth and the hints."""
-    told = json.dumps([image.bit_depth, image.hints], sort_keys=True)
+    """Compute the SHA-256 of all that an extractor receives: the file's bytes, bit depth, hints and place in time."""
+    place = [] if image.time_s is None else [image.recording, image.time_s]
+    told = json.dumps([image.bit_depth, image.hints, *place], sort_keys=True)
     return hashlib.sha256(read_bytes(image.path) + told.encode()).hexdigest()
 
 

@@ -44,6 +44,8 @@ class BenchImage:
         gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
         edge: the pupil's edge (`bound`); None if it is unknown.
         sigma_px: bound of the centre's standard deviation per axis; None where it does not apply.
+        recording: what the frames of one eye, seen by one camera, share.
+        time_s: time of the frame in its recording; None outside sequences.
     """
 
     name: str
@@ -67,6 +69,8 @@ class BenchImage:
     centre_px: tuple[float, float] | None = None
     edge: Edge | None = None
     sigma_px: float | None = None
+    recording: str = ""
+    time_s: float | None = None
 
     @classmethod
     def read(
