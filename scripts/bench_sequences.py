@@ -46,7 +46,7 @@ print(json.dumps(found))
 """
 
 
-def aimed(targets_mm: Any, head_mm: Any, eye: int) -> Any:
+def aimed(targets_mm: Any, head_mm: Any, _torsion_rad: Any, eye: int) -> Any:
     """Turn a simple eye towards targets."""
     gap = targets_mm - head_mm - np.array([0.0, 31.5 if eye else -31.5, 0.0])
     return np.arctan2(gap[:, 1], gap[:, 0]), np.arctan2(gap[:, 2], np.hypot(gap[:, 0], gap[:, 1]))

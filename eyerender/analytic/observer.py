@@ -189,6 +189,10 @@ class AnalyticObserver:
         )
         return observed, seen
 
+    def at_instants(self, frames: Traceable) -> Features:
+        """Compute pupils and glints at the times of frames, whatever the shutters of their cameras."""
+        return self._traced(frames, (1,))
+
     def _traced(self, frames: Traceable, purkinje: Sequence[int]) -> Features:
         """Compute the features of rows at the times of their frames."""
         scene, index, pose = frames.scene, frames.index, frames.pose

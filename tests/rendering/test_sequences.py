@@ -10,6 +10,7 @@ import pytest
 
 import eyerender as er
 from eyerender.imaging.capture import render_job
+from eyerender.imaging.labels import image_labels
 from eyerender.imaging.moments import moments
 from eyerender.rendering.records.job import SubFrames
 from eyerender.scene.observation import EYES
@@ -157,6 +158,27 @@ def test_a_rolling_shutter_before_a_moving_eye_is_valid(renderer, tmp_path):
     assert found["problems"] == []
     lines = [entry.line for entry in er.ImageFolder.load(tmp_path / "out")]
     assert all(line["records"][0]["pupil"]["time_s"] != line["time_s"] for line in lines)
+
+
+def test_lids_and_spots_under_a_rolling_shutter_are_those_of_their_rows(renderer):
+    """Each landmark is where it is in a picture at the time of its row; in a blink, and a saccade."""
+    lids = {"time_s": [-0.05, 0.05], "blink": [0.0, 0.8]}
+    scene = in_time(sequence={**turning(200.0, -2.0, 0.05), "lids": lids}, camera=SLOW_ROWS, **SMALL)
+    frames = scene.frames().take([1])
+    (image,) = er.render_windows(frames, renderer=renderer)
+    labels = image_labels(image, er.trace(frames))
+    timing, start = scene.timings[0], frames.index.start_s[0]
+    for lid in ("upper", "lower"):
+        for k in (4, 8, 12):
+            x, y = labels["lid_margins_px"][lid][k]
+            then = frames.at([0], np.array([timing.ambient_s(start, y)]))
+            bound, _ = renderer.bind(render_job(then, 0), lit=False)
+            np.testing.assert_allclose((x, y), bound.host.lid_margins_px[lid][k], atol=2e-3)
+    for glint in labels["glints"]:
+        if glint["visible"] and glint["visible_share"] == 1.0:
+            assert np.linalg.norm(np.subtract(glint["spot_xy_px"], glint["xy_px"])) < 0.05
+    both = (labels["lid_margins_px"], image.rendered.lid_margins_px)  # the latter at mid-exposure
+    assert np.abs(np.subtract(*(lids["upper"] + lids["lower"] for lids in both))).max() > 0.2
 
 
 def test_fields_of_an_interlaced_camera_show_the_eye_one_after_the_other(renderer):

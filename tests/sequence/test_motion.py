@@ -14,7 +14,7 @@ from eyerender.scene.sequence.spec import Sequence
 TIMES = 1e-3 * np.arange(20_000, dtype=float)
 
 
-def aim(targets_mm, head_mm, eye):
+def aim(targets_mm, head_mm, torsion_rad, eye):
     """An eye at the side of the origin that turns about its apex."""
     gap = targets_mm - head_mm - np.array([0.0, 31.5 if eye else -31.5, 0.0])
     azimuth = np.arctan2(gap[:, 1], gap[:, 0])
@@ -101,7 +101,7 @@ def test_eyes_look_at_their_targets_between_saccades_and_converge_on_near_ones()
     states = course(gaze={"targets": [near, far], "oscillation": False, **QUIET}).at(TIMES)
     still = ~states.events[:, 2]
     for eye in (0, 1):
-        wanted = aim(states.target_mm, states.head_mm, eye)
+        wanted = aim(states.target_mm, states.head_mm, None, eye)
         np.testing.assert_allclose(states.azimuth_rad[still, eye], wanted[0][still], atol=1e-6)
         np.testing.assert_allclose(states.elevation_rad[still, eye], wanted[1][still], atol=1e-6)
     apart = np.degrees(states.azimuth_rad[still, 0] - states.azimuth_rad[still, 1])

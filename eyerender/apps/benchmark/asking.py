@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ...base.errors import InputError
 from ...base.jit import ensure_compiled
@@ -25,10 +26,12 @@ from ...base.references import is_reference
 from ...base.storage.files import MAX_FILE_BYTES, appended, parse_json, read_bytes, read_text, write_text
 from ...folders.imagefolder import versions
 from ...folders.outfolder import mark
+from ...optics.ellipse import Ellipse
 from .labelled import BenchImage
 from .options import BenchOptions
 from .process import ExtractorProcess, Failed
 from .protocol import Greeting, Reply, Request
+from .recordings import pieces, previous
 from .registry import PREFIX, WORKER, ExtractorCommand
 from .score import Score, failed, score
 
@@ -79,8 +82,9 @@ class Answers:
 
 
 def image_key(image: BenchImage) -> str:
-    """Compute the SHA-256 of everything that an extractor receives: the file's bytes, the bit depth and the hints."""
-    told = json.dumps([image.bit_depth, image.hints], sort_keys=True)
+    """Compute the SHA-256 of all that an extractor receives: the file's bytes, bit depth, hints and place in time."""
+    place = [] if image.time_s is None else [image.recording, image.time_s]
+    told = json.dumps([image.bit_depth, image.hints, *place], sort_keys=True)
     return hashlib.sha256(read_bytes(image.path) + told.encode()).hexdigest()
 
 
@@ -163,8 +167,7 @@ def ask_extractors(
         ensure_compiled()  # once, before the clocks of several processes run
     known = Answers() if answers is None else answers
     askers = [_Asker(extractor, images, options, known, step) for extractor in extractors]
-    size = -(-len(images) // options.jobs) or 1
-    parts = [range(start, min(start + size, len(images))) for start in range(0, len(images), size)]
+    parts = pieces(previous(images), options.jobs)
     with ThreadPoolExecutor(options.jobs) as pool:
         try:
             for done in [pool.submit(asker.ask, part) for asker in askers for part in parts]:
@@ -189,6 +192,7 @@ class _Asker:
         step: Callable[[str], None],
     ) -> None:
         self._extractor, self._images, self._options = extractor, images, options
+        self._before, self._last = previous(images), dict[int, Ellipse]()
         self._stored, self._step = stored, step
         self._answers: list[_Answer | None] = [None] * len(images)
         self._greeting: Greeting | None = None
@@ -205,7 +209,9 @@ class _Asker:
                 if self._stopped or failures >= PATIENCE:
                     return
                 try:
-                    self._answers[row], process = self._answer(row, process)
+                    answer, process = self._answer(row, process)
+                    self._answers[row] = answer
+                    self._remember(row, answer.reply)
                     failures = 0
                 except Failed as failure:
                     failures += 1
@@ -255,11 +261,22 @@ class _Asker:
                 return _Answer(reply, trip_s), process
         if process is None or not process.alive:
             process = self._open(process)
-        image = self._images[row]
-        reply, trip_s = process.ask(Request(row, str(image.path.resolve()), image.bit_depth, image.hints))
+        image, before = self._images[row], self._before[row]
+        prior = None if before is None else self._last.get(before)
+        hints = {**image.hints, "prior": None if prior is None else _prior(prior)}
+        reply, trip_s = process.ask(Request(row, str(image.path.resolve()), image.bit_depth, hints))
         if reply.error is None:
             self._stored.put(self._extractor.name, row, (reply.line, process.greeting_line, trip_s))
         return _Answer(reply, trip_s), process
+
+    def _remember(self, row: int, reply: Reply | None) -> None:
+        """Keep the pupil that was found last up to a frame."""
+        before = self._before[row]
+        found = None if reply is None else reply.ellipse
+        if found is None and before is not None:
+            found = self._last.get(before)
+        if found is not None:
+            self._last[row] = found
 
     def _open(self, before: ExtractorProcess | None) -> ExtractorProcess:
         self._close(before)
@@ -277,3 +294,9 @@ class _Asker:
             process.close()
             with self._lock:
                 self._processes.discard(process)
+
+
+def _prior(pupil: Ellipse) -> dict[str, Any]:
+    """Return what an extractor is told of the pupil that it found last, in this package's conventions."""
+    x, y, a, b, angle = pupil.numbers()
+    return {"centre_px": [x, y], "semi_axes_px": [a, b], "angle_rad": angle}

@@ -45,6 +45,8 @@ class BenchImage:
     centre_px: tuple[float, float] | None = None  # (x, y) of a pupil of which only the centre is known
     edge: Edge | None = None  # the pupil's edge (`bound`); None if it is unknown
     sigma_px: float | None = None  # bound of the centre's standard deviation per axis; None where it does not apply
+    recording: str = ""  # what the frames of one eye, seen by one camera, share
+    time_s: float | None = None  # time of the frame in its recording; None outside sequences
 
     @classmethod
     def read(

@@ -107,6 +107,8 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> BenchImage:
         mask_path=entry.mask_path,
         conditions=tuple(of_scene(entry.line, ellipse, corner) | of_events(entry.records[0])),
         hidden_glints_px=tuple(hidden),
+        recording=f"{entry.line.get('subject')} {truth.index.camera[row]} {truth.index.eye[row]}",
+        time_s=None if entry.line.get("time_s") is None else float(entry.line["time_s"]),
     )
 
 

@@ -143,7 +143,7 @@ def _scored(runs: Sequence[ExtractorResults], images: Sequence[BenchImage], keys
             name: {"what": what, "images": [i.name for i in images if name in i.conditions]}
             for name, what in CONDITIONS.items()
         },
-        "extractors": [entry_of(run) for run in runs],
+        "extractors": [entry_of(run, images) for run in runs],
         "common": common_errors(runs),
         "pairs": pairs_of(runs),
     }

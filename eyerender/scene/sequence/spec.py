@@ -18,8 +18,9 @@ from .files import MAX_ROWS, read_columns, read_times
 Closure = Annotated[float, Field(ge=0, le=1)]
 Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=MAX_ROWS)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
-Aiming = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
-"""Turns an eye (0 right, 1 left) towards targets (k, 3) mm with the head at (k, 3) mm: azimuth and elevation, rad."""
+Aiming = Callable[[Floats, Floats, Floats, int], tuple[Floats, Floats]]
+"""Turns an eye (0 right, 1 left) with a torsion (k,) rad beyond Listing's towards targets (k, 3) mm with the head at
+(k, 3) mm: azimuth and elevation, rad."""
 
 
 def _source(value: Any) -> str:
