@@ -7,7 +7,7 @@ Drawn adults with bare eyes are rendered with blur discs of 0, 1 and 3 px at the
 turns by 100 deg/s, in a frame whose glints are at least 5 px from the outline of the pupil. Each frame is exposed 100
 times with other noise, and extracted. The scatter is the standard deviation of the pupil's centre and of each glint,
 per axis, where they are found within ten median distances of their median. It is compared with `extracted_noise`,
-propagated to the centre of an ellipse by the exact outline. The factor of its outlines was fitted on the people and
+propagated to the centre of an ellipse by the exact outline. The factor of its glints was fitted on the people and
 rigs `fitted`; the bars are those of other people and rigs, `checked`. The sampling error of a scatter is 5 %.
 """
 

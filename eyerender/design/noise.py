@@ -50,7 +50,7 @@ PUPIL_DEPTH_MM, ROTATION_MM = 3.5, 10.0
 BESIDE_PUPIL = 0.8
 """Light of the iris beside the pupil over that of a mean iris that is lit alike (four rendered ones: 0.74 to 0.82)."""
 _SAMPLES, _REACH = 400, 6.0
-_EXTRACTED_OUTLINE, _EXTRACTED_GLINT = 1.25, 1.3
+_EXTRACTED_GLINT = 1.1
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -111,8 +111,8 @@ def sensor_noise(
 def extracted_noise(scene: Scene, *, fixation_deg: float = FIXATION_DEG) -> FeatureNoise:
     """Compute the noise of the features that `extract` finds, for pupils that are no ellipses; equation (2b).
 
-    Lamps light the iris obliquely, and it is darker beside the pupil. Glints lie on the iris. Two factors were fitted
-    to the scatter in rendered frames; `scripts/bench_noise.py` compares both with that of other people and rigs.
+    Lamps light the iris obliquely, and it is darker beside the pupil. Glints lie on the iris; the factor 1.1 of their
+    noise was fitted to rendered frames. `scripts/bench_noise.py` compares both with frames of other people and rigs.
     """
     return _noise_of(scene, True, fixation_deg, scene.rig.lights)
 
@@ -144,7 +144,7 @@ def _noise_of(scene: Scene, extracted: bool, fixation_deg: float, lights: Sequen
             spread = float(np.hypot(blur, size))
             glint[k, j] = glint_deviation(point * energy, spread, behind, read, sensor.full_well_e)
     if extracted:
-        outline, glint = outline * _EXTRACTED_OUTLINE, glint * _EXTRACTED_GLINT
+        glint = _EXTRACTED_GLINT * glint
     return FeatureNoise(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
 
 
