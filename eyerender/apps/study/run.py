@@ -37,6 +37,7 @@ STUDIES: Final = MappingProxyType(
         "pupil-size": "pupil_size:PupilSizeStudy",
         "calibration": "calibration_study:CalibrationStudy",
         "stereo": "stereo:StereoStudy",
+        "head-movement": "head_movement:HeadMovementStudy",
     }
 )
 """Name of a study -> its class in this package."""
