@@ -30,6 +30,9 @@ from .study import Study, StudyJob, StudyPlan, changed, of_person
 
 KEY = ("corrected", "image")
 WINDOW_PX = (128, 96)
+TARGETS_MM = [[0.0, 0.0], *([a, b] for a in (-188.5, 188.5) for b in (-150.5, 150.5))]
+LATER_MM = [[0.0, 30.0, 0.0], [-40.0, 0.0, 0.0]]
+"""Of the rig's nine targets the centre and the corners, and of its four later head positions one aside and one back."""
 NONE, ALL, RAYS = "none", "all together", "ray optics"
 CAUSES: Mapping[str, Mapping[str, Any]] = MappingProxyType({
     NONE: {},
@@ -49,10 +52,10 @@ def scene_of(base: Scene, causes: Mapping[str, Any], later: bool) -> Scene:
     for light in rig["lights"]:
         light["radius_mm"] = causes.get("radius_mm", light["radius_mm"])
     rig["lights"][1]["intensity_mw_sr"] *= causes.get("intensity", 1.0)
-    heads = base.spec.to_mapping()["subject"]["head_positions_mm"]
     changes: dict[str, Any] = {
         "rig": rig, "image": {"window_px": WINDOW_PX},
-        "subject": {"eyes": ["right"], "head_positions_mm": heads[1:] if later else heads[:1]},
+        "targets": {"screen_mm": TARGETS_MM},
+        "subject": {"eyes": ["right"], "head_positions_mm": LATER_MM if later else [[0.0, 0.0, 0.0]]},
         **{name: causes[name] for name in ("lens", "ambient") if name in causes},
     }  # fmt: skip
     if later and "later_mm" in causes:
@@ -83,7 +86,8 @@ class HeadMovementStudy(Study):
     title = "Head movement and images"
     about = (
         "The right eyes of drawn people before the rig of Guestrin and Eizenman (2006), in noiseless images: a bare "
-        "eye and an ideal lens, then one cause more, then all causes. Each is calibrated at H1 with the same cause.",
+        "eye and an ideal lens, then one cause more, then all causes. Each is calibrated at H1 with the same cause. Of "
+        "the rig's targets there are five, of its later head positions two, so that many people can be rendered.",
         "The causes are glare of .09 with a ghost of .001; uneven light, from a second lamp of half the power and a "
         "window at the side; lamps of 12 mm radius instead of 2.5 mm, whose glints the cornea deforms; a stop that is "
         ".5 mm wider at H2; and lids with lashes.",
