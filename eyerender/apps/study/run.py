@@ -64,8 +64,8 @@ def run_study(
     >>> er.apps.run_study("conditions", "out/conditions", eyes=["E2"])  # doctest: +SKIP
 
     Args:
-        study: guestrin2006, blignaut2014, observers, conditions or rigs; or your own: a subclass of `Study`, or its
-            name as `module:Class`.
+        study: a name of `STUDIES`, such as guestrin2006; or your own: a subclass of `Study`, or its name as
+            `module:Class`.
         folder: the folder for the results.
         options: protocol, observer, workers and the like.
         eyes: eye models (catalogue names or files; default: those of the study, or none if people are asked for).
