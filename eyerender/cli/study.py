@@ -24,7 +24,7 @@ def study(
     options: Annotated[StudyOptions, Parameter(name="*")] = StudyOptions(),
     json: Result = None,
 ) -> int:
-    """Replicate a published gaze study, compare observers, conditions or rigs, or run a study of your own.
+    """Replicate a published gaze study, measure over people what others left open, or run a study of your own.
 
     The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is updated
     in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are reused.
@@ -33,9 +33,11 @@ def study(
         name: guestrin2006 (model-based gaze), blignaut2014 (interpolation-based gaze), observers (analytic against
             image-derived features on the head-mounted rig), conditions (analytic errors over the screen, head
             positions, pupil sizes and eye parameters), rigs (six known layouts over a population: for whom each fails
-            where, and the effect of each LED), glasses (what lenses do to features, loss and every estimator),
-            pupil-size (how measured size and gaze depend on the pupil), appearance (networks that learn gaze from
-            pictures of each eye model; the extra torch), or a study of your own as module:Class.
+            where, and the effect of each LED), pupil-size (its measured size over gaze, gaze over its size),
+            calibration (targets and slippage with every estimator), stereo (posterior cornea, and how the eye turns),
+            head-movement (what images do to the error when the head moves), glasses (what lenses do to features, loss
+            and every estimator), appearance (networks that learn gaze from pictures of each eye model; the extra
+            torch), or a study of your own as module:Class.
         eyes: Eye models separated by commas, as catalogue names or eye files (default: those of the study).
     """
     from ..apps.study.run import REPORT, load_study, run_study

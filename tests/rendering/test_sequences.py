@@ -178,7 +178,8 @@ def test_lids_and_spots_under_a_rolling_shutter_are_those_of_their_rows(renderer
         if glint["visible"] and glint["visible_share"] == 1.0:
             assert np.linalg.norm(np.subtract(glint["spot_xy_px"], glint["xy_px"])) < 0.05
     both = (labels["lid_margins_px"], image.rendered.lid_margins_px)  # the latter at mid-exposure
-    assert np.abs(np.subtract(*(lids["upper"] + lids["lower"] for lids in both))).max() > 0.2
+    own, middle = (np.array(lids["upper"] + lids["lower"]) for lids in both)
+    assert np.abs(own - middle).max() > 0.2
 
 
 def test_fields_of_an_interlaced_camera_show_the_eye_one_after_the_other(renderer):

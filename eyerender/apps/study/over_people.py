@@ -46,7 +46,7 @@ def people_rows(groups: Mapping[str, Groups], measured: Mapping[str, Experiment]
 
     Args:
         groups: name of a person -> errors.
-        measured: condition, or its end after a comma -> what the experiment found.
+        measured: condition, or its end after a comma or blank -> what the experiment found.
     """
     by: dict[tuple[str, str, str], dict[str, Floats]] = {}
     for who, found in groups.items():
@@ -65,7 +65,9 @@ def people_rows(groups: Mapping[str, Groups], measured: Mapping[str, Experiment]
         if observer != "analytic" and (both := [who for who in means if known_mean(exact.get(who, np.zeros(0)))]):
             added = np.array([means[who] - (known_mean(exact[who]) or 0.0) for who in both])
             row |= {f"added_{key}": value for key, value in summary(added).items() if key[0] != "p"}
-        told = measured.get(name) or measured.get(name.rpartition(", ")[2])
+        told = measured.get(
+            name.rpartition(" ")[2] if name.rpartition(", ")[2] not in measured else name.rpartition(", ")[2]
+        )
         if told is not None:
             row |= {"measured_deg": told.mean_deg, "measured_low_deg": told.low_deg, "measured_high_deg": told.high_deg}
             if told.low_deg is not None and told.high_deg is not None:

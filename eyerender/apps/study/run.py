@@ -38,6 +38,7 @@ STUDIES: Final = MappingProxyType(
         "pupil-size": "pupil_size:PupilSizeStudy",
         "calibration": "calibration_study:CalibrationStudy",
         "stereo": "stereo:StereoStudy",
+        "head-movement": "head_movement:HeadMovementStudy",
         "appearance": "appearance:AppearanceStudy",
     }
 )

@@ -38,7 +38,7 @@ from .literature import MODELS, VARIANTS
 from .observers_compared import compare_observers
 from .observing import Observing
 from .options import StudyOptions
-from .over_people import Experiment, Groups, listed, people_rows
+from .over_people import Experiment, Groups, line_of, listed, people_rows
 from .page_parts import (
     Apart,
     budget_section,
@@ -114,6 +114,7 @@ class Study:
         population: preset from which people are drawn; None if the study draws none.
         observers: observers that can be chosen; the first is the default.
         protocols: names of the readings of a paper.
+        of_models: whether findings and sections are about eye models alone, and people have a table.
         facing: whether cameras are turned to the eyes for images.
         shown: names of the estimators in figures of the error budget and of the observers; empty for all.
         method: the algorithm in words, for the error budget.
@@ -132,6 +133,7 @@ class Study:
     population: ClassVar[str | None] = "adults"
     observers: ClassVar[Sequence[str]] = ("analytic", "image", "both")
     protocols: ClassVar[Sequence[str]] = ("own",)
+    of_models: ClassVar[bool] = False
     facing: ClassVar[bool] = False
     shown: ClassVar[Sequence[str]] = ()
     method: ClassVar[str] = "the estimator"
@@ -283,15 +285,16 @@ class Study:
 
     def report(self, parts: Sequence[Any], protocols: Sequence[str]) -> StudyReport:
         """Compose findings, summary and page."""
-        apart = compare_observers(parts)
+        own = [p for p in parts if p.person is None] if self.of_models else list(parts)
+        apart = compare_observers(own)
         made_of = budgets([p for p in parts if p.person is None and p.eye_model not in VARIANTS])
-        found, faults = self.findings(parts), self.errata(parts)
+        found, faults = (self.findings(own) if own else []), self.errata(own)
         listing = {name: rows for name, rows in self.tables(parts).items() if rows}
         steps: list[WaterfallStep] = [step for part in parts for step in part.waterfall]
         shown = tuple(self.shown) or tuple(dict.fromkeys(b.estimator for b in made_of))[:4]
         sections = [
             budget_section(made_of, shown, self.method),
-            *self.sections(parts),
+            *(self.sections(own) if own else ()),
             *(listed(name, rows) for name, rows in listing.items()),
             observers_section(apart, shown),
             findings_section(found) if found else None,
@@ -299,7 +302,7 @@ class Study:
             errata_section(self.departures, faults) if self.departures else None,
         ]
         features, gaze = apart
-        more = self.more(parts, protocols) | listing
+        more = (self.more(own, protocols) if own else {}) | listing
         more |= {"error_budget": [{**asdict(b), "terms": list(map(asdict, b.terms))} for b in made_of]}
         if self.departures:
             more |= {name: list(map(asdict, some)) for name, some in
@@ -314,7 +317,7 @@ class Study:
             more=more,
             tables=({"waterfall.csv": (header, lines)} if self.departures else {})
             | {f"{name}.csv": (list(rows[0]), [list(row.values()) for row in rows]) for name, rows in listing.items()},
-            page=Page(self.title, self.about, self.cards(parts, apart), sections),
+            page=Page(self.title, self.about, self.cards(own, apart), sections),
         )
 
     def text(self, summary: Mapping[str, Any]) -> list[str]:
@@ -327,7 +330,8 @@ class Study:
                 f"{row['protocol']:<12} {row['observer']:<15} {row['eye_model']:<18} {row['eye']:<6} {mean:>9} "
                 f"{row['n']:>4}  {condition}"
             )
-        return lines
+        people = [line_of(row) for row in summary.get("people", ())]
+        return people if people and (self.of_models or len(lines) == 1) else lines
 
 
 def _part(study: Study, job: StudyJob) -> Any:
