@@ -274,7 +274,7 @@ def reachable_by(lenses: Sequence[WornLens], choice: Choice, end: Xyz, towards: 
     found = np.ones(np.shape(end[0]), dtype=bool)
     nothing = np.zeros(found.shape)
     for k in choice:
-        found &= lenses[k].reachable(end, towards or (nothing, nothing, nothing))
+        found = found & lenses[k].reachable(end, towards or (nothing, nothing, nothing))
     return found
 
 
