@@ -360,9 +360,10 @@ def lens_glint_features(
         return None
     places = index.eye_position_mm + index.head_mm
     moved = np.nan_to_num(np.concatenate([index.rig_rotation_rad, index.rig_translation_mm], axis=1))
-    keys, rows, back = np.unique(
-        np.column_stack([index.camera, which, places, moved]), axis=0, return_index=True, return_inverse=True
-    )
+    keys: dict[bytes, int] = {}
+    table = np.column_stack([index.camera, which, places, moved])
+    back = np.array([keys.setdefault(key.tobytes(), len(keys)) for key in table], dtype=np.intp)
+    rows = np.unique(back, return_index=True)[1]
     rigs = [scene.rig_at(index, int(row)) for row in rows]
     found = [
         _images_of(rig, eyes[which[row]], int(index.eye[row]), int(index.camera[row]), places[row])
@@ -383,7 +384,7 @@ def lens_glint_features(
     whole = LensGlintFeatures(
         status=status, light=light, reason=reason, in_image=inside, xy_px=xy, surface=surface, index=number
     )
-    return whole.take(back.reshape(-1))
+    return whole.take(back)
 
 
 def _images_of(rig: RigGeometry, eye: EyeModel, side: int, camera: int, place_mm: Floats) -> list[LensImage]:

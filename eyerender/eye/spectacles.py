@@ -8,7 +8,7 @@ The front is a sphere with the base curve F1, so F2 = (1 - n) / R follows for bo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -111,12 +111,24 @@ class _Solved(NamedTuple):
 OWN = "`own`: the prescription of the drawn person, for each eye, in scenes with a `population`"
 OWN_MISSING = "needs a drawn person: `population`, or person.spectacles() and person.contact_lens() in Python"
 
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "reading": {"sphere_d": 2.0, "outline_mm": (23.0, 13.0), "vertex_mm": 15.0, "pantoscopic_deg": 12.0},
+    "single vision": {"material": "1.60", "outline_mm": (25.0, 17.0)},
+    "safety": {"material": "polycarbonate", "thickness_mm": 2.2, "wrap_deg": 10.0, "outline_mm": (30.0, 23.0)},
+    "sport wrap": {"material": "polycarbonate", "thickness_mm": 2.0, "base_curve_d": 8.0, "wrap_deg": 20.0,
+                   "outline_mm": (32.0, 20.0)},
+}  # fmt: skip
+"""Keys of common glasses (chosen): single vision for powers of -6 to +6 D; safety and sport glasses are plano."""
+
 _PRESCRIBED = ("sphere_d", "cylinder_d", "axis_deg", "material", "index", "base_curve_d", "thickness_mm")
 
 
 class SpectacleLens(Spec):
     """A lens of spectacles or an insert in front of one eye: a prescription that is solved, or surfaces as made."""
 
+    preset: Literal["reading", "single vision", "safety", "sport wrap"] | None = Field(
+        default=None, description="common glasses, whose keys replace the defaults below"
+    )
     sphere_d: Dioptres = Field(default=0.0, description="back vertex power of the sphere at 546 nm, dioptres")
     cylinder_d: Dioptres = Field(default=0.0, description="cylinder at 546 nm, which acts across the axis, dioptres")
     axis_deg: Annotated[float, Field(ge=0, le=180)] = Field(
@@ -167,6 +179,14 @@ class SpectacleLens(Spec):
         default=None,
         description="what holds the lens, in pictures with a region; default: as `{}`, and none at index 1",
     )
+
+    @model_validator(mode="after")
+    def _of_preset(self) -> Self:
+        """Fill in the keys of a preset that are not given."""
+        for key, value in PRESETS.get(self.preset or "", {}).items():
+            if key not in self.model_fields_set and not (key == "material" and self.index is not None):
+                self.__dict__[key] = value
+        return self
 
     @model_validator(mode="after")
     def _check(self) -> Self:

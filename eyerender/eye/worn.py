@@ -17,6 +17,7 @@ import numpy as np
 from ..base.arrays import ArrayValue, Bools, Floats, Indices, Statuses
 from ..base.status import Status, mark
 from ..optics.interface import dot, fresnel, minus, moved
+from ..optics.shooting import taken
 from ..optics.surfaces import Surface, Xyz, components, join, shift, turn_back
 from ..optics.trace import Crossing, Traced, trace
 
@@ -88,6 +89,12 @@ class WornLens(ArrayValue):
     def local(self, point: Xyz) -> Xyz:
         """Transform points to the lens's axes, with the centre of the outline as origin."""
         return turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
+
+    @property
+    def outline(self) -> Floats:
+        """Centre of the outline, and both its axes over their lengths, (..., 3, 3), for the compiled solver."""
+        y, z = (self.rotation[..., :, k] / half for k, half in zip((1, 2), self.half_mm, strict=True))
+        return np.stack([self.centre_mm, y, z], axis=-2)
 
     def inside(self, point: Xyz) -> Bools:
         """Return whether points lie inside the outline, seen along the lens's x axis."""
@@ -196,12 +203,27 @@ class Course:
             for k, owner in enumerate(self.owners):
                 if owner is not None:
                     mark(status, ~self.lenses[owner].inside(points[k + 1]), Status.AT_LENS_EDGE)
-            for k in self._in_air():
-                ends = {self.owners[i] for i in (k - 1, k) if 0 <= i < len(self.owners)}
-                for j, lens in enumerate(self.lenses):
-                    if j not in ends:
-                        mark(status, lens.touches(points[k], points[k + 1]), Status.AT_LENS_EDGE)
+            for k, lens in self.beside():
+                mark(status, lens.touches(points[k], points[k + 1]), Status.AT_LENS_EDGE)
         return traced, status
+
+    def outlines(self) -> Floats:
+        """Return the outline of each crossing, (..., s, 3, 3), with axes of 0 at those of the eye."""
+        owned = [np.zeros((3, 3)) if k is None else self.lenses[k].outline for k in self.owners]
+        return np.stack(np.broadcast_arrays(*owned), axis=-3)
+
+    def beside(self) -> list[tuple[int, WornLens]]:
+        """Return the segments in air and the lenses that they must not touch; segment k ends at crossing k."""
+        out = []
+        for k in self._in_air():
+            ends = {self.owners[i] for i in (k - 1, k) if 0 <= i < len(self.owners)}
+            out += [(k, lens) for j, lens in enumerate(self.lenses) if j not in ends]
+        return out
+
+    def take(self, rows: Indices) -> Course:
+        """Select rows of a batch."""
+        path, lenses = tuple(taken(c, rows) for c in self.path), tuple(lens.take(rows) for lens in self.lenses)
+        return replace(self, path=path, lenses=lenses)
 
     def _in_air(self) -> list[int]:
         """Return the numbers of the segments in air; segment k ends at crossing k."""
@@ -219,7 +241,7 @@ def reachable_by(lenses: Sequence[WornLens], choice: Choice, end: Xyz, towards: 
     found = np.ones(np.shape(end[0]), dtype=bool)
     nothing = np.zeros(found.shape)
     for k in choice:
-        found &= lenses[k].reachable(end, towards or (nothing, nothing, nothing))
+        found = found & lenses[k].reachable(end, towards or (nothing, nothing, nothing))
     return found
 
 

@@ -137,6 +137,15 @@ class Quadric(Surface):
         """Return (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame; numbers or (n,) arrays."""
         return self._eye
 
+    def about(self, point_mm: Floats) -> tuple[Floats | float, ...]:
+        """Return the coefficients measured from a point (..., 3) of the eye frame, along the same axes."""
+        xx, yy, zz, xy, xz, yz, *_ = self._eye
+        x, y, z = np.moveaxis(self.origin_mm - point_mm, -1, 0)
+        u, v, w = np.moveaxis(np.einsum("...ij,...j->...i", self.rotation, self.vector), -1, 0)
+        pulled = (xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z)
+        constant = self.constant + sum(a * (p - 2.0 * b) for a, p, b in zip((x, y, z), pulled, (u, v, w), strict=True))
+        return (xx, yy, zz, xy, xz, yz, u - pulled[0], v - pulled[1], w - pulled[2], constant)
+
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
         """Solve (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 for the required sign of d.g, as F / (-b -+ sqrt(b^2 - aF))."""
         ox, oy, oz = origin

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from decimal import Decimal, getcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from eyerender.base.errors import InputError
 from eyerender.eye.contact import EDGE_MM, ContactLens
 from eyerender.eye.landmarks import at_cornea_d, refraction_d
 from eyerender.eye.spec import EyeSpec
-from eyerender.eye.spectacles import MATERIALS, NOMINAL_NM, SpectacleLens, demand_through_d, lenses_of
+from eyerender.eye.spectacles import MATERIALS, NOMINAL_NM, PRESETS, SpectacleLens, demand_through_d, lenses_of
 from eyerender.optics.trace import trace
 from eyerender.scene.scene import demand_d
 from eyerender.scene.spec import SceneSpec, SubjectSpec
@@ -275,6 +277,36 @@ def test_a_myope_behind_spectacles_accommodates_less():
     asked = demand_through_d((lens_of(sphere_d=-6.0),), distance)[0] + far
     assert asked == pytest.approx(2.59, abs=0.005)
     assert demand_through_d((), distance)[0] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_fill_in_what_is_not_given(name):
+    lens = lens_of(preset=name)
+    assert lens.outline_mm == PRESETS[name]["outline_mm"]
+    assert lens_of(**lens.to_mapping()) == lens
+    assert lens_of(preset=name, outline_mm=[20.0, 14.0]).outline_mm == (20.0, 14.0)
+    assert lens_of(preset=name, index=1.5).material is None
+    power = power_matrix(lens.build("right", NOMINAL_NM))
+    assert abs(power[0, 0] - PRESETS[name].get("sphere_d", 0.0)) < 0.15  # the tilt adds some power
+
+
+@pytest.mark.parametrize("sphere", [-6.0, -3.0, 3.0, 6.0])
+def test_single_vision_takes_powers_to_6_d(sphere):
+    lens = lens_of(preset="single vision", sphere_d=sphere)
+    assert lens.mean_d == sphere
+    with pytest.raises(InputError, match="preset"):
+        lens_of(preset="varifocal")
+
+
+def test_random_rays_through_tilted_lenses_agree_with_optiland():
+    """Spheres, conics and planes in front of right and left eyes; `scripts/tools/optiland_lenses.py` made the file."""
+    rays = json.loads((Path(__file__).parents[1] / "data/optiland_lenses.json").read_text(encoding="utf-8"))["rays"]
+    assert len(rays) == 100
+    for ray in rays:
+        lens = lens_of(**ray["lens"]).build(ray["side"], 850.0)
+        traced = trace(lens.inward(), 1.0, ray["start_mm"], ray["direction"])
+        assert np.abs(traced.points_mm[-1] - ray["end_mm"]).max() < 1e-9
+        assert np.abs(traced.directions[-1] - ray["end_direction"]).max() < 1e-11
 
 
 PERSON = er.Population(preset="adults").person(3, 0)

@@ -200,7 +200,7 @@ def test_images_of_people_are_rendered_within_their_jobs(tmp_path):
     """The features of a person's images are those of ray optics within a fifth of a pixel; the table pairs them."""
     scene = of_person(guestrin.scene("E2", guestrin.CORRECTED), PERSON)
     scene = changed(scene, {"subject": {"eyes": ["right"], "head_positions_mm": [[0.0, 0.0, 0.0]]}})
-    seen = Observing("image-noiseless", spp=4).observe(scene, facing=True)
+    seen = Observing(kind="image-noiseless", spp=4).observe(scene, facing=True)
     assert np.nanmax(np.abs(seen.pupil.centre_px - trace(scene).pupil.centre_px)) < 0.2
     summary = run_study(
         "guestrin2006", tmp_path / "out", people=2, image_people=2, observer="both", noise="off", protocol="corrected",

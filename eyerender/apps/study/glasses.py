@@ -66,7 +66,7 @@ ESTIMATORS: Mapping[str, GazeEstimator] = {
     "Shih-Wu-Liu": ShihWuLiu(),
     "maximum likelihood": MaximumLikelihood(),
 }
-TWO_CAMERAS = ("Shih-Wu-Liu", "maximum likelihood")
+TWO_CAMERAS = ("Shih-Wu-Liu",)
 WRONG_PX = 2.0
 """A feature of an image farther than this from its true place counts as wrong (chosen)."""
 _SCREEN = (650.0, 440.0, 250.0)  # distance, width and height, mm
@@ -94,7 +94,7 @@ def scene_before(person: Mapping[str, Any], *, imaged: bool) -> Scene:
             "screen": {"centre_mm": [away, 0.0, 0.0], "size_mm": [width, height]},
         },
         "targets": {"grid": [SIDE, SIDE]},
-        "image": {"window_px": [320, 240], "spp": 4},
+        "image": {"window_px": [240, 180], "spp": 4},
         "sensor": {
             "f_number": 2.4, "exposure_ms": 8.0, "psf_sigma_px": 0.75, "pixel_pitch_um": 5.0, "full_well_e": 15000,
             "read_noise_e": 6.0, "black_level_dn": 2560,
@@ -142,22 +142,26 @@ def _estimates(seen: Mapping[str, Observations], rig: RigGeometry) -> dict[tuple
     """Compute the errors of the tested targets by estimator, condition and calibration."""
     out = {}
     for name, estimator in ESTIMATORS.items():
-        if name == "Shih-Wu-Liu" and len(rig.cameras) < 2:
+        if name in TWO_CAMERAS and len(rig.cameras) < 2:
             continue
         rows = {c: o if name in TWO_CAMERAS else o.take(o.index.camera == 0) for c, o in seen.items()}
         bare = _fitted(estimator, rows[NONE], rig)
         for condition, own in rows.items():
-            before = _predicted(bare, own, rig)
-            for how in CALIBRATIONS:
-                gaze = before
-                if how == SAME and condition != NONE:
-                    gaze = _predicted(_fitted(estimator, own, rig), own, rig)
-                if how == OFFSET:
-                    middle = np.flatnonzero((own.index.fixation == CENTRE) & (own.index.camera == 0))
-                    gaze = GazePoints.of(gaze.point_mm - (gaze.point_mm - own.index.target_mm)[middle].mean(axis=0))
-                tested, whole = ~_learnt(own) & (own.index.camera == 0), errors_of(own, gaze)
+            shown = own.take(~_learnt(own) | (own.index.fixation == CENTRE))
+            first, middle = shown.index.camera == 0, shown.index.fixation == CENTRE
+            before = _predicted(bare, shown, rig)
+            fitted = bare if condition == NONE else _fitted(estimator, own, rig)
+            offset = np.mean((before.point_mm - shown.index.target_mm)[first & middle], axis=0)
+            by = {
+                WITHOUT: before,
+                SAME: before if fitted is bare else _predicted(fitted, shown, rig),
+                OFFSET: GazePoints.of(before.point_mm - offset),
+            }
+            tested = first & ~middle
+            for how, gaze in by.items():
+                error = errors_of(shown, gaze)
                 out[name, condition, how] = EstimatorErrors(
-                    error_deg=whole.error_deg[tested], vector_deg=whole.vector_deg[tested]
+                    error_deg=error.error_deg[tested], vector_deg=error.vector_deg[tested]
                 )
     return out
 
