@@ -98,9 +98,8 @@ def _dependences(found: list[dict[str, Any]] | None) -> list[str]:
 @app.command(name="realism")
 def realism(
     folder: Annotated[Path, Parameter(name="DIR")],
-    other: Annotated[Path | None, Parameter(name="OTHER")] = None,
     /,
-    *,
+    *other: Annotated[Path, Parameter(name="OTHER")],
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
     gamma: tuple[float, ...] = (),
     limit: int = 200,
@@ -109,11 +108,12 @@ def realism(
     """Measure image statistics of eye pictures: contrasts, edges, texture, highlights, noise.
 
     With a second folder, such as frames of your own camera, the command compares both. A classifier then measures how
-    well patches of the two can be told apart; this needs scikit-learn, which is not installed by default.
+    well patches of the two can be told apart; this needs scikit-learn, which is not installed by default. With folders
+    of three or more cameras, it is trained on all cameras but one and tested on that one.
 
     Args:
         folder: A folder of images of one eye each: written by this package, exported by it, or your own.
-        other: A second folder, to compare with.
+        other: A second folder, to compare with, or a folder for each of several cameras.
         output: An HTML page to write, with the table and montages at equal scale.
         gamma: Encoding gamma of the pixel values; give it twice for two folders. Default: the value that a folder of
             this package or an export states, else 1 (linear).
@@ -123,7 +123,7 @@ def realism(
 
     if output is not None and output.suffix.lower() not in (".html", ".htm"):
         raise InputError("must end with .html", source="--output")
-    folders = [folder] if other is None else [folder, other]
+    folders = [folder, *other]
     with progress("measuring") as steps:
         data = measured(folders, output=output, gammas=gamma, limit=limit, progress=steps)
     page = f"\n\npage: {output}" if output is not None else ""
@@ -139,10 +139,10 @@ def _table(data: dict[str, Any]) -> str:
     lines = []
     for k, f in enumerate(folders):
         lines.append(
-            f"{'AB'[k]}: {f['path']}: {f['measured']} of {f['images']} images, gamma {f['gamma']:g} "
+            f"{chr(65 + k)}: {f['path']}: {f['measured']} of {f['images']} images, gamma {f['gamma']:g} "
             f"({f['gamma_from']}), pupil and iris from: {f['landmarks']}"
         )
-    heads = "".join(f"{'AB'[k]:>10} {'middle half':>19}" for k in range(len(folders)))
+    heads = "".join(f"{chr(65 + k):>10} {'middle half':>19}" for k in range(len(folders)))
     lines += ["", f"{'':<24}{heads}{'A / B':>9}" if ratios else f"{'':<24}{heads}"]
     for name in data["definitions"]:
         cells = ""
@@ -158,6 +158,18 @@ def _test(data: dict[str, Any]) -> list[str]:
     """Format one line per kind of patch: how well the two folders can be told apart."""
     if len(data["folders"]) < 2:
         return []
+    if len(data["folders"]) > 2:
+        lines = [
+            "",
+            f"{'told from an unseen camera':<28}{'AUC':>6} {'90 % interval':>15}{'a camera':>10} {'90 % interval':>15}",
+        ]
+        for kind, found in (data["left_out"] or {}).items():
+            if found is None:
+                lines.append(f"{kind:<28}{'-':>6} {'too few images':>15}")
+                continue
+            own, placebo = ("[{:.2f}, {:.2f}]".format(*found[f"{name}interval_90"]) for name in ("", "placebo_"))
+            lines.append(f"{kind:<28}{found['auc']:>6.2f} {own:>15}{found['placebo']:>10.2f} {placebo:>15}")
+        return lines
     if data["separability"] is None:
         return ["", f"two-sample test: {data['separability_reason']}"]
     lines = ["", f"{'told apart (.5 chance)':<24}{'AUC':>10} {'90 % interval':>19}{'images':>12}"]

@@ -254,3 +254,19 @@ def test_bad_input_ends_with_one_line(arguments, message, frames, tmp_path, monk
     assert len(error) == 1
     assert message in error[0]
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.packaging
+def test_a_folder_is_told_from_a_camera_that_was_left_out_only_where_it_differs_from_all():
+    pytest.importorskip("sklearn")
+    from eyerender.apps.realism.separability import left_out
+
+    cameras = [_folder(100 * k, 4.0 + k) for k in range(1, 4)]
+    like_them, unlike = (left_out(_folder(900, sigma), cameras)["iris"] for sigma in (6.5, 1.5))
+    assert unlike.auc > 0.95
+    assert unlike.interval[0] > like_them.interval[0]
+    assert like_them.auc < 0.85
+    assert like_them.cameras == 3
+    assert like_them.placebo == unlike.placebo  # it does not depend on the folder
+    assert like_them.placebo_interval[0] <= like_them.placebo <= like_them.placebo_interval[1]
+    assert left_out(_folder(900, 6.5), cameras[:2])["iris"] is None

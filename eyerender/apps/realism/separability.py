@@ -4,6 +4,10 @@ The classifier (extremely randomised trees, Geurts, Ernst and Wehenkel 2006, by 
 and tested on others; the patches of an image are never split. The result is the area under the ROC curve of its
 held-out predictions, averaged per image: .5 means that the folders cannot be told apart, 1 that every image can.
 
+Any two cameras can be told apart by what has nothing to do with eyes. So `left_out` trains the classifier on a folder
+against several cameras, and tests it on one camera that it never saw: what it finds must tell the folder from cameras
+at large. As a placebo, each camera in turn takes the folder's place.
+
 Cameras differ in properties that a renderer need not imitate: resolution, sharpness, noise, compression and exposure.
 So each picture is first resized to the same iris radius, blurred more than any lens in question, scaled so that its
 98th percentile has a fixed grey level, compressed as JPEG, and covered with new noise.
@@ -143,6 +147,85 @@ def separability(one: FolderFigures, other: FolderFigures, seed: int = 0) -> dic
     return {kind: _tested([p[kind] for p in one.patches], [p[kind] for p in other.patches], seed) for kind in KINDS}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeftOut:
+    """How well a folder is told from a camera that the classifier never saw, and how well a camera from the others.
+
+    Attributes:
+        cameras: number of cameras with enough images.
+        auc: mean area under the ROC curve of the first folder over the cameras that were left out.
+        interval: its 5 % and 95 % quantiles over images drawn with replacement.
+        placebo: the mean area of one camera, told from the others, over all pairs of cameras.
+        placebo_interval: the 5 % and 95 % quantiles of the areas of these pairs.
+    """
+
+    cameras: int
+    auc: float
+    interval: tuple[float, float]
+    placebo: float
+    placebo_interval: tuple[float, float]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Convert to a mapping for JSON."""
+        both = {"interval_90": list(self.interval), "placebo_interval_90": list(self.placebo_interval)}
+        return {"cameras": self.cameras, "auc": self.auc, "placebo": self.placebo, **both}
+
+
+def left_out(ours: FolderFigures, cameras: Sequence[FolderFigures], seed: int = 0) -> dict[str, LeftOut | None]:
+    """Test every kind of patch; None if fewer than three cameras, or not ours, have `LEAST_IMAGES` images with it.
+
+    Raises:
+        ImportError: scikit-learn is not installed.
+    """
+    return {kind: _left_out([[p[kind] for p in one.patches] for one in (ours, *cameras)], seed) for kind in KINDS}
+
+
+def _left_out(folders: Sequence[Sequence[tuple[Bytes, ...]]], seed: int) -> LeftOut | None:
+    shown = [[np.stack([features(p) for p in patches]) for patches in images if patches] for images in folders]
+    enough = [images for images in shown[1:] if len(images) >= LEAST_IMAGES]
+    if len(shown[0]) < LEAST_IMAGES or len(enough) < 3:
+        return None
+    sources, places = [shown[0], *enough], range(1, len(enough) + 1)
+    answers = [_of_unseen(sources, 0, k, seed) for k in places]
+    pairs = [_auc(*_of_unseen(sources, j, k, seed)) for j in places for k in places if j != k]
+    rng = np.random.default_rng((0x1EF7, seed))
+    drawn = []
+    for _ in range(_RESAMPLED):
+        images = [rng.integers(0, n, n) for n in map(len, sources)]
+        taken = [np.concatenate([images[0], len(images[0]) + images[k]]) for k in places]
+        drawn.append(np.mean([_auc(a[at], second[at]) for (a, second), at in zip(answers, taken, strict=True)]))
+    low, high = (float(v) for v in np.quantile(drawn, (0.05, 0.95)))
+    below, above = (float(v) for v in np.quantile(pairs, (0.05, 0.95)))
+    return LeftOut(
+        cameras=len(enough),
+        auc=float(np.mean([_auc(*answer) for answer in answers])),
+        interval=(low, high),
+        placebo=float(np.mean(pairs)),
+        placebo_interval=(below, above),
+    )
+
+
+def _of_unseen(sources: Sequence[Sequence[Floats]], one: int, unseen: int, seed: int) -> tuple[Floats, Any]:
+    """Return the chances of the images of `one`, and of a camera that is `unseen`, to be of `one`; and which are.
+
+    The classifier is trained on half of the images of `one` against all other cameras, twice.
+    """
+    from sklearn.ensemble import ExtraTreesClassifier
+
+    own, strange = sources[one], sources[unseen]
+    others = [image for k, images in enumerate(sources) if k not in (0, one, unseen) for image in images]
+    chance, far = np.empty(len(own)), np.zeros(len(strange))
+    for half in (0, 1):
+        known = own[1 - half :: 2]
+        values = np.concatenate([*known, *others])
+        second = np.arange(len(values)) < sum(map(len, known))
+        trees = ExtraTreesClassifier(_TREES, min_samples_leaf=2, class_weight="balanced", random_state=seed)
+        trees.fit(values, second)
+        chance[half::2] = [trees.predict_proba(image)[:, 1].mean() for image in own[half::2]]
+        far += [0.5 * trees.predict_proba(image)[:, 1].mean() for image in strange]
+    return np.concatenate([chance, far]), np.arange(len(own) + len(strange)) < len(own)
+
+
 def available() -> bool:
     """Return whether scikit-learn is installed."""
     return find_spec("sklearn") is not None
@@ -197,6 +280,6 @@ def _interval(answer: Floats, second: Any, seed: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def to_mapping(found: Mapping[str, Separability | None]) -> dict[str, Any]:
+def to_mapping(found: Mapping[str, Separability | LeftOut | None]) -> dict[str, Any]:
     """Convert the tests of all kinds to a mapping for JSON."""
     return {kind: None if result is None else result.to_mapping() for kind, result in found.items()}
