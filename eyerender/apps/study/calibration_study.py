@@ -26,7 +26,6 @@ from ...gaze.homography import Homography
 from ...gaze.likelihood import MaximumLikelihood
 from ...gaze.regression import Regression
 from ...gaze.twocamera import ShihWuLiu
-from ...report.page import Section
 from ...rig.rig import RigGeometry
 from ...scene import Scene
 from ...scene.observation import Observations
@@ -162,10 +161,6 @@ class CalibrationStudy(Study):
 
     def rows(self, done: Mapping[str, Any], seen: Any, keys: Mapping[str, Any]) -> Sequence[Any]:
         """Leave the errors of single people to the table of all."""
-        return ()
-
-    def sections(self, parts: Sequence[ModelResults]) -> Sequence[Section]:
-        """Leave the page to the table of people."""
         return ()
 
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 
 from ...base.arrays import Floats
-from ...report.page import Card, Section
 from ...scene import Scene
 from ...scene.observation import Observations, concatenate
 from . import guestrin
 from .findings import RISE
 from .observing import Observing
 from .over_people import Experiment, Groups, differs, interval
-from .page_parts import Apart
 from .results import Finding, ModelResults, known_mean
 from .study import Study, StudyJob, StudyPlan, changed, of_person
 
@@ -131,22 +129,11 @@ class HeadMovementStudy(Study):
                 for name in (*CAUSES, ALL) if name != NONE and len(values := _effects(parts, name)) > 1]  # fmt: skip
         return {"causes": rows, **super().tables(parts)}
 
-    def sections(self, parts: Sequence[ModelResults]) -> Sequence[Section]:
-        """Leave the page to the tables."""
-        return ()
-
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
         """Test each cause, and the conjecture: all together make people rise as the experiment's did."""
         found = {name: values for name in (*CAUSES, ALL) if name != NONE and len(values := _effects(parts, name)) > 1}
         return [differs("M1", KEY, f"{name} adds to the rise (deg)", values, "images cause the rise")
                 for name, values in found.items()]  # fmt: skip
-
-    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> list[Card]:
-        """Return the effect of all causes."""
-        rows = [row for row in self.tables(parts)["causes"] if row["cause"] == ALL]
-        text = "deg are added to the rise by all causes together (95 % interval); the experiment's rise is .133"
-        ends = [tuple(row[f"adds to the rise, deg_{end}"] for end in ("mean", "low", "high")) for row in rows]
-        return [Card(f"{mean:+.3f} ({low:+.3f} to {high:+.3f})", text) for mean, low, high in ends]
 
 
 def _rise(part: ModelResults, name: str) -> float:

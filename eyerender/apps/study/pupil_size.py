@@ -32,14 +32,11 @@ from ...eye.model import EyeModel
 from ...gaze.budget import error_vectors_deg
 from ...gaze.directions import DirectionRegression
 from ...imaging.capture import EyeImage
-from ...report.page import Card, Figure, Section
 from ...scene import Scene, load_scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
-from .figures import lines_figure
 from .observing import Observing, extracted
 from .over_people import OtherEyes, interval, line_of, resampled, summary
-from .page_parts import Apart
 from .results import Finding, ModelResults
 from .study import Study, StudyJob, changed, name_of, of_person
 
@@ -104,10 +101,8 @@ def sizes_of(seen: Observations) -> dict[str, Floats]:
 def cosines(seen: Observations, scene: Scene) -> Floats:
     """Return the cosine (n,) of the angle between the lines from the eye to its camera and to its target."""
     place = seen.index.eye_position_mm + seen.index.head_mm
-    ways = [
-        seen.index.target_mm - place,
-        np.array([scene.rig.cameras[c].nodal_point_mm for c in seen.index.camera]) - place,
-    ]
+    cameras = np.array([scene.rig.cameras[c].nodal_point_mm for c in seen.index.camera])
+    ways = (seen.index.target_mm - place, cameras - place)
     a, b = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways)
     return np.asarray(np.sum(a * b, axis=1))
 
@@ -117,9 +112,9 @@ def thresholded(image: EyeImage, level: float, centre_px: Floats) -> float:
     dark, _ = label(image.counts < level)
     x, y = np.clip(np.rint(centre_px - image.window[:2]).astype(int), 0, np.array(dark.shape)[::-1] - 1)
     found = np.bincount(dark[max(y - 5, 0) : y + 6, max(x - 5, 0) : x + 6].ravel(), minlength=2)
-    return (
-        float(np.sqrt(binary_fill_holes(dark == 1 + np.argmax(found[1:])).sum() / np.pi)) if found[1:].any() else np.nan
-    )
+    if not found[1:].any():
+        return np.nan
+    return float(np.sqrt(binary_fill_holes(dark == 1 + np.argmax(found[1:])).sum() / np.pi))
 
 
 def half_level(image: EyeImage, seen: Observations) -> float:
@@ -153,13 +148,8 @@ def straight_ahead(scene: Scene, seen: Observations) -> dict[str, float]:
 def artefacts(scene: Scene) -> dict[str, Floats]:
     """Compute the changes d (luminances, eyes, targets, 2) deg of the gaze error, to the right and up, by cause."""
     points = [[1000.0, y, z] for z in (130.0, 0.0, -130.0) for y in (220.0, 110.0, 0.0, -110.0, -220.0)]
-    lit = {
-        one: changed(
-            scene,
-            {"targets": {"world_mm": points}, "subject": {"luminance_cd_m2": one}, "eye": {"pupil_diameter_mm": None}},
-        )
-        for one in LUMINANCES
-    }
+    scene = changed(scene, {"targets": {"world_mm": points}, "eye": {"pupil_diameter_mm": None}})
+    lit = {one: changed(scene, {"subject": {"luminance_cd_m2": one}}) for one in LUMINANCES}
     frames = lit[CALIBRATED].frames()
     seen = trace(frames)
     fitted = DirectionRegression("R3").fit(seen, scene.rig)
@@ -247,24 +237,6 @@ class PupilSizeStudy(Study):
         """Return sizes over gaze, sizes straight ahead, and artefacts from the lowest to the highest luminance."""
         return {"sizes": size_rows(parts), "straight_ahead": straight_rows(parts), "artefacts": artefact_rows(parts)}
 
-    def cards(self, parts: Sequence[ModelResults], apart: Apart) -> list[Card]:
-        """Return the artefacts."""
-        text = f"gaze error from {LUMINANCES[0]:g} to {LUMINANCES[-1]:g} cd/m2"
-        found = [row for row in artefact_rows(parts) if row["cause"] == "whole"]
-        return [Card(f"{row['mean_deg']:.1f}°", f"{text}, {row['camera']}") for row in found]
-
-    def sections(self, parts: Sequence[ModelResults]) -> list[Section]:
-        """Draw the errors of the size."""
-        lines: dict[str, dict[str, Any]] = {}
-        for row in size_rows(parts):
-            if (row["observer"], row["stop_mm"]) == ("analytic", TABLE_MM):
-                lines.setdefault(row["camera"], {})[row["correction"]] = row["by_eccentricity"]
-        if not lines:
-            return []
-        caption = "Error of the measured size against straight ahead, rms over people and directions."
-        drawn = lines_figure(lines, ECCENTRICITIES_DEG, "eccentricity of gaze (deg)", "error (%)")
-        return [Section("The measured size over gaze", Figure(drawn, caption))]
-
     def text(self, summary: Mapping[str, Any]) -> list[str]:
         """Format one line per size and artefact."""
         return [line_of(row) for name in ("sizes", "artefacts") for row in summary.get(name, ())]
@@ -302,11 +274,10 @@ def size_rows(parts: Sequence[ModelResults]) -> list[dict[str, Any]]:
         for name, one in errors.items():
             off = 100.0 * np.abs(one[:, 1:] - 1.0)
             low, high = resampled(off, _p95)
-            rings = np.sqrt(np.nanmean(off.reshape(len(off), -1, TURNS) ** 2, axis=(0, 2))).tolist()
             rows.append({
                 "observer": observer, "camera": camera, "stop_mm": mm, "correction": name, "people": len(off),
                 "missing": int(np.isnan(off).sum()), "p50": float(np.nanmedian(off)), "p95": _p95(off), "low": low,
-                "high": high, "by_eccentricity": rings,
+                "high": high,
             })  # fmt: skip
     return rows
 

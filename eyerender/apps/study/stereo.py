@@ -19,7 +19,6 @@ from ...eye.batch import stack_stops, take_stops
 from ...eye.model import EyeModel
 from ...eye.pose import Poses, rigid_motion
 from ...gaze.twocamera import ShihWuLiu
-from ...report.page import Section
 from ...scene import Frames, Scene
 from ...scene.observation import PoseTruth
 from .calibration_study import grid, means_of, rig_scene, tested
@@ -96,10 +95,6 @@ class StereoStudy(Study):
             f"{name}, {RISE}": own[f"{name}, H2"].mean(keepdims=True) - own[f"{name}, H1"].mean() for name in CELLS
         }
         return {KEY: {**own, **rises}}
-
-    def sections(self, parts: Sequence[ModelResults]) -> Sequence[Section]:
-        """Leave the page to the table of people."""
-        return ()
 
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
         """Test [26] (a posterior cornea adds a rise, in either way) and the paper's explanation."""

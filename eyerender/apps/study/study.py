@@ -259,6 +259,8 @@ class Study:
     def sections(self, parts: Sequence[Any]) -> Sequence[Section]:
         """Return the page's own sections; by default the error over the conditions."""
         names = list(self.conditions)
+        if not any(part.rows for part in parts):
+            return []
         if len(names) < 2:
             return [rows_section(parts)]
         panels: dict[str, dict[str, list[float]]] = {}
