@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 import sys
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -45,10 +46,12 @@ CLEAR_PX = 5.0
 
 @dataclass(frozen=True)
 class Measured:
-    """Scatter per axis, stated noise and noise of the sensor alone (px) of the pupil's centre and of the glints."""
+    """Scatter per axis, stated noise and bound (px) of the pupil's centre, and stated noise over scatter of glints."""
 
-    centre: tuple[float, float, float]
-    glints: list[tuple[float, float, float]]
+    scatter: float
+    stated: float
+    bound: float
+    glints: list[float]
     found: float
 
 
@@ -65,7 +68,7 @@ def scene_of(name: str, subject: int, seed: int, disc_px: float, speed_deg_s: fl
     eye = scene.eye_position_mm("right") + np.array(scene.spec.subject.head_positions_mm[0])
     depth = float(camera.depth(eye - [PUPIL_DEPTH_MM, 0.0, 0.0]))
     strength = float(camera.K[0, 0]) ** 2 * sensor.pixel_pitch_um * 1e-3 / sensor.f_number
-    changes = {"region": None, "lens.focus_mm": 1.0 / (1.0 / depth - disc_px / strength)}
+    changes: dict[str, Any] = {"region": None, "lens.focus_mm": 1.0 / (1.0 / depth - disc_px / strength)}
     if speed_deg_s:
         changes["motion"] = {"eye_deg_s": [speed_deg_s, 0.0]}
     return scene.with_(changes)
@@ -105,14 +108,14 @@ def measured(scene: er.Scene, frame: int, draws: int) -> Measured:
     ]
     seen, exact, alone = er.ImageObserver(backend="llvm").observe_images(exposed), er.trace(frames), sensor_noise(scene)
     stated, points = extracted_noise(scene), exact.pupil.points_px[0]
-    bounds = (centre_bound(points, float(noise.outline_px[0])) for noise in (stated, alone))
+    centre, least = (centre_bound(points, float(noise.outline_px[0])) for noise in (stated, alone))
     glints = []
     for k in range(len(scene.rig.lights)):
         there = seen.glints.ok & (seen.glints.light == k)
         if there.any(axis=1).mean() > 0.9:
-            noises = (float(noise.glint_px[0, k]) for noise in (stated, alone))
-            glints.append((scatter(seen.glints.xy_px[there]), *noises))
-    return Measured((scatter(seen.pupil.centre_px[seen.pupil.ok]), *bounds), glints, float(seen.pupil.ok.mean()))
+            glints.append(float(stated.glint_px[0, k]) / scatter(seen.glints.xy_px[there]))
+    found = seen.pupil.ok
+    return Measured(scatter(seen.pupil.centre_px[found]), centre, least, glints, float(found.mean()))
 
 
 def main() -> int:
@@ -129,14 +132,13 @@ def main() -> int:
                 scene = scene_of(name, subject, seed, disc, speed)
                 found = measured(scene, clear_frame(scene, subject), draws)
                 what = f"{kind}, {name} {subject}, {disc:g} px, {speed:g} deg/s"
-                actual, stated, alone = found.centre
                 report.add(row(f"{what}: found", found.found, "share"))
-                report.add(row(f"{what}: scatter of the centre", actual, "px"))
-                report.add(row(f"{what}: bound of the centre", alone, "px"))
-                report.add(row(f"{what}: centre, stated over scatter", stated / actual, "ratio"))
-                centres.append(stated / actual)
+                report.add(row(f"{what}: scatter of the centre", found.scatter, "px"))
+                report.add(row(f"{what}: bound of the centre", found.bound, "px"))
+                centres.append(found.stated / found.scatter)
+                report.add(row(f"{what}: centre, stated over scatter", centres[-1], "ratio"))
                 if found.glints:
-                    glints.append(float(np.median([s / a for a, s, _ in found.glints])))
+                    glints.append(float(np.median(found.glints)))
                     report.add(row(f"{what}: glints, stated over scatter, median", glints[-1], "ratio"))
         must = BAR if kind == "checked" and not options.quick else None
         for what, ratios in (("centre", np.array(centres)), ("glints", np.array(glints))):
