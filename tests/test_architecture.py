@@ -241,7 +241,7 @@ def lines_of(package: str = "") -> int:
 BOUNDS = {
     "": 99300,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1210,  # eyes behind spectacles, and their reflections; Purkinje images of pictures, for trackers
-    "apps": 17480,  # the honest test of pictures; users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
+    "apps": 17480,  # the honest test of pictures; users' own studies, a rule for each sentence of a paper; two rigs
     "backends": 990,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2710,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2760,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
