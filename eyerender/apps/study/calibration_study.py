@@ -39,8 +39,8 @@ POLYNOMIALS = {3: ("1 + x + y", "1 + x + y"), 5: ("1 + x + y + xy", "1 + x + y +
 SLIPS = {"headset": 1.5, "remote": 20.0}
 """Displacement of the eye along each axis in turn, mm (chosen: a headset's slippage, a head's motion)."""
 PUPIL, GLINT, MODEL = "pupil only", "pupil-glint, directions", "guestrin-eizenman"
-TWO, SLOW, SLOW_PEOPLE = "shih-wu-liu", "maximum-likelihood", 4
-"""The estimator of two cameras, and one that takes 20 s for each person, so that only the first people have it."""
+TWO, SLOW, SLOW_PEOPLE = "shih-wu-liu", "maximum-likelihood", 3
+"""The estimator of two cameras, and one that takes 10 s for each person, so that only the first people have it."""
 
 
 def rig_scene(kind: str, heads_mm: Sequence[Sequence[float]], screen_mm: Sequence[Sequence[float]]) -> Scene:
