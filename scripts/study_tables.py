@@ -107,7 +107,7 @@ def people_tables(data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _calibrations(rows: list[dict[str, Any]]) -> str:
-    """Format the errors of calibrations: a column for each number of targets; fewer people than elsewhere are stated."""
+    """Format the errors of calibrations: a column per number of targets; fewer people than elsewhere are stated."""
     by: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
     for row in rows:
         rig, *estimator, targets, when = row["condition"].split(", ")
