@@ -315,7 +315,7 @@ POSITIONAL = {
     "Biconic", "BoundaryPixels", "CalibrationErrors", "DeviceSurface", "EyeImage", "EyePicture",
     "Finding", "FunctionErrors", "GradientMedium", "GridSurface", "GuestrinEizenman", "LashPlan", "Patch", "Quadric",
     "RegionLayout", "RigGeometry",
-    "Observing", "Regression", "Scene", "Score", "Stop", "Table", "ZernikeSurface", "_Table",
+    "Regression", "Scene", "Score", "Stop", "Table", "ZernikeSurface", "_Table",
 }  # fmt: skip
 
 
