@@ -57,8 +57,8 @@ def test_a_fuzzed_file_is_read_or_refused_in_one_line(name, tmp_path):
 
 # Functions that interpret nothing of what they read, or read only what this process has just written.
 EXCEPTIONS = {
-    "apps.benchmark.answers._digest": "hashes bytes",
-    "apps.benchmark.answers.image_key": "hashes bytes",
+    "apps.benchmark.asking._digest": "hashes bytes",
+    "apps.benchmark.asking.image_key": "hashes bytes",
     "cli.benchmark.bench_extractors": "the result of this run",
     "dataset.packing.pack": "the shard of this run",
     "dataset.packing._write_tar": "the pictures of this run",
