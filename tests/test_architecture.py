@@ -254,7 +254,7 @@ BOUNDS = {
     "imaging": 3640,  # lids and spots at the times of their rows; lenses, and the glints they hide
     "optics": 5460,
     "population": 2610,  # children who become more myopic as they grow, for trackers of children
-    "region": 4110,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
+    "region": 4120,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
     "rendering": 13190,  # moments that share lids and skin, for makers of films; pictures through spectacles
     "report": 990,
     "rig": 4630,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
