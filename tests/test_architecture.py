@@ -239,9 +239,9 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 99530,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 99540,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1200,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
-    "apps": 17890,  # users' own studies, a rule for each sentence of a paper; rigs compared; what glasses do, for makers
+    "apps": 17900,  # users' own studies, a rule for each sentence of a paper; rigs compared; what glasses do, for makers
     "backends": 990,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2710,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2740,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
