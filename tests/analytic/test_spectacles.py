@@ -13,9 +13,10 @@ from eyerender.analytic.observer import trace
 from eyerender.base.errors import InputError
 from eyerender.base.status import Status
 from eyerender.cli.main import main
-from eyerender.eye.legs import lens_images
+from eyerender.eye.legs import apparent_places, lens_images
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.spectacles import SpectacleLens
+from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace as trace_rays
 from eyerender.scene import Scene
 from eyerender.scene.observation import Observations
@@ -352,3 +353,21 @@ def test_obstacles_hide_the_same_glints_behind_a_lens_of_no_power():
     worn = statuses(spectacles={"surfaces": {"front_radius_mm": None, "back_radius_mm": None, "thickness_mm": 0.5,
                                              "index": 1.001}, "vertex_mm": 12})  # fmt: skip
     assert np.array_equal(worn, bare)
+
+
+def test_lamps_appear_from_the_eye_where_a_thin_lens_images_them():
+    """A lamp 487 mm before a lens 13 mm from the apex: its vergence -1000 / 487 D, plus the power at 850 nm."""
+    lens = SpectacleLens(sphere_d=-4.0, pantoscopic_deg=0.0, wrap_deg=0.0)
+    worn = lens.build("right", 850.0)
+    power = -4.0 * (worn.index - 1.0) / (lens.nominal_index - 1.0)
+    found = apparent_places([worn], np.array([[500.0, 0.0, 0.0]]))[0]
+    assert found[0] == pytest.approx(13.0 - 1000.0 / (power - 1000.0 / 487.0), rel=0.01)
+    assert np.abs(found[1:]).max() < 0.1
+
+
+def test_a_quadric_about_a_point_has_the_coefficients_of_the_moved_one():
+    lens = SpectacleLens(sphere_d=-3.0).build("left", 850.0)
+    point = np.array([12.0, 0.0, 0.0])
+    assert isinstance(lens.front, Quadric)
+    moved = lens.front.seen_from(point, np.eye(3)).coefficients
+    np.testing.assert_allclose(np.array(lens.front.about(point)), np.array(moved), rtol=1e-14, atol=1e-13)

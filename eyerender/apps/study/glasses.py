@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -146,6 +147,8 @@ def _extracted(frames: Frames) -> Observations:
 def _estimates(seen: Mapping[str, Observations], rig: RigGeometry) -> dict[tuple[str, str, str], EstimatorErrors]:
     """Compute the errors of the tested targets by estimator, condition and calibration."""
     out = {}
+    # Trackers do not know which spots are reflections of lenses.
+    seen = {condition: replace(own, lens_glints=None) for condition, own in seen.items()}
     for name, estimator in ESTIMATORS.items():
         if name in TWO_CAMERAS and len(rig.cameras) < 2:
             continue
