@@ -18,7 +18,7 @@ class StudyOptions:
     Attributes:
         population: Preset from which people are drawn (default: adults).
         people: Number of people, in place of eye models unless --eyes names some (default: none; rigs, appearance:
-            100; conditions: 4, beside the models).
+            100; conditions: 4, beside the models; 24 to 100 in studies that have people only).
         image_people: Number of these people whose images are rendered (default: all).
         protocol: guestrin2006 and blignaut2014: as the authors' software computes (published), as the paper describes
             (corrected), or both.

@@ -192,6 +192,7 @@ def _settings(name: str, plan: StudyPlan) -> dict[str, Any]:
     }
     if plan.people:
         settings |= {"population": plan.people[0]["preset"], "people": len(plan.people)}
+        settings |= {} if options.image_people is None else {"image_people": options.image_people}
     if plan.observer in IMAGE_OBSERVERS:
         settings |= {"spp": options.spp, "sensor_noise": options.noise, "noise_seeds": options.noise_seeds}
     return settings | _exposure(options.auto_exposure, plan.observer)

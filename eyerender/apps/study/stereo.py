@@ -67,7 +67,7 @@ class StereoStudy(Study):
         "position, tested there (H1) and at four others (H2), 30 mm to the sides and 40 mm in depth.",
     )
     eyes = ()
-    people = 24
+    people = 100
     observers = ("analytic",)
 
     def scenes(self, job: StudyJob, protocol: str) -> Mapping[str, Scene]:
