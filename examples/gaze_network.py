@@ -40,7 +40,7 @@ from own_labels import Label, labels, refuse
 from eyerender.base.errors import InputError
 from eyerender.dataset import find_dataset
 from eyerender.torch import Augment
-from eyerender.torch.gaze import NAMES, Arrays, GazeNetwork, angle_deg, answers, gaze_errors, read, trained
+from eyerender.torch.gaze import GRID, NAMES, Arrays, GazeNetwork, angle_deg, answers, gaze_errors, read, trained
 
 SIZE = 128  # width and height of the pictures that the network sees, px
 AUGMENT = Augment(flip=0.0, scale=(0.7, 1.5), roll_deg=20.0)
@@ -135,6 +135,9 @@ def report(name: str, networks: list[GazeNetwork], data: Arrays) -> None:
     print(f"{name}: {len(people)} pictures of {len(np.unique(people))} people, {len(networks)} networks")
     for key in each[0]:
         mean, low, high = interval(np.mean([one[key] for one in each], axis=0), people)
+        if np.isnan(mean):
+            print(f"  {key:27s} none: no picture has it, or no eye has over {len(GRID)} with a known gaze")
+            continue
         seeds = " ".join(f"{interval(one[key], people)[0]:.3f}" for one in each)
         print(f"  {key:27s} {mean:7.3f}  ({low:.3f} to {high:.3f})  each: {seeds}")
 

@@ -157,7 +157,10 @@ def main() -> int:
     print("mean IoU of unseen subjects: " + ", ".join(shown))
     if options.save is not None:
         torch.save(network.state_dict(), options.save)
-    return int(not bool((iou[2:4] >= MUST).all()))
+    short = [n for n, v in zip(PARTS[2:4], iou[2:4].tolist(), strict=True) if not v >= MUST]
+    if short:
+        print(f"below {MUST}: {', '.join(short)}; more images or epochs help (--epochs)", file=sys.stderr)
+    return 1 if short else 0
 
 
 if __name__ == "__main__":

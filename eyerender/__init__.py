@@ -4,6 +4,7 @@ The names in `__init__.pyi` are the whole interface. They load their modules on 
 neither Mitsuba nor OpenCV nor numba. If Dr.Jit is imported later, whoever imports it, it loads a libLLVM that renders.
 """
 
+import importlib
 import inspect
 from pathlib import Path
 
@@ -24,6 +25,8 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> object:
     """Load a public name; a function checks its arguments."""
+    if name == "torch":  # not in `__all__`, as it needs an extra
+        return importlib.import_module(".torch", __name__)
     if name not in __all__:
         from .base.errors import nearest
 

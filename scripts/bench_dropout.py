@@ -23,7 +23,7 @@ from _bench import Report, options_of, row, single_threaded
 single_threaded()
 
 import eyerender as er
-from eyerender.base.arrays import Bools
+from eyerender.base.arrays import Bools, Floats
 from eyerender.design import people
 from eyerender.design.unknowns import COUNT, Unknowns
 from eyerender.scene.spec import SceneSpec
@@ -91,13 +91,14 @@ def main() -> int:
     parser.add_argument("--people", type=int, default=4, help="people before each rig")
     options = parser.parse_args()
     count, report = 1 if options.quick else options.people, Report()
-    must, sums = None if options.quick else SHARE, {}
+    must = None if options.quick else SHARE
+    sums: dict[tuple[str, float | None], Floats] = {}
     for name in CAMERAS:
         survey = survey_of(rig_of(name))
         for plain in people.people_of(survey, 5, count)[0]:
             for upper in UPPER:
-                height = max(upper * plain.region.fissure.upper_mm, 2.2)
-                fissure = plain.region.fissure.model_copy(update={"upper_mm": height})
+                upper_mm = max(upper * plain.region.fissure.upper_mm, 2.2)
+                fissure = plain.region.fissure.model_copy(update={"upper_mm": upper_mm})
                 one = replace(plain, region=plain.region.model_copy(update={"fissure": fissure}))
                 exist, rig = lost_by_rig(survey, one)
                 lid, lash = (exist & hidden for hidden in lost_by_labels(survey, one))
@@ -105,11 +106,11 @@ def main() -> int:
                 for key in ((name, upper), (name, None), ("both", None)):
                     sums[key] = sums.get(key, np.zeros(5)) + counts
             print(f"camera {name}: person {plain.subject}", file=sys.stderr, flush=True)
-    for (name, upper), (lid, lash, lost, both, lashes) in sorted(sums.items(), key=lambda one: one[0][1] is None):
-        what = f"{name}, upper lids at {'any height' if upper is None else f'{100 * upper:.0f} %'}"
+    for (name, height), (lid, lash, lost, both, lashes) in sorted(sums.items(), key=lambda one: one[0][1] is None):
+        what = f"{name}, upper lids at {'any height' if height is None else f'{100 * height:.0f} %'}"
         report.add(row(f"{what}: glints that labels lose", lid + lash, ""))
         report.add(row(f"{what}: of them behind lashes", lash, ""))
-        bar = must if upper is None else None
+        bar = must if height is None else None
         report.add(row(f"{what}: lost by labels, and by rig", both / max(lid + lash, 1), "share", bar, at_least=True))
         report.add(row(f"{what}: lost by rig, and by labels", both / max(lost, 1), "share", bar, at_least=True))
         if lash:

@@ -23,11 +23,13 @@ import numpy as np
 
 from _bench import Report, Row, options_of, row
 from eyerender.analytic.features import Features, features
+from eyerender.analytic.observer import trace
 from eyerender.base.errors import InputError
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.fixation import fixations
-from eyerender.scene import load_scene
+from eyerender.scene import Scene, load_scene
 from eyerender.scene.people import Population
+from eyerender.scene.spec import SceneSpec
 
 EYES = ("E2", "E4", "E5")
 # Best published time of a Python simulator of such eyes, ms a frame without fixation; quoted, not measured here.
@@ -78,6 +80,7 @@ def measure(quick: bool) -> Iterator[Row]:
     spread = max(growth.values()) / min(growth.values())
     yield row(f"E2, slowest / fastest, 1000 to {most} frames", spread, "ratio", 1.2)
     yield row("1000 different eyes / the same eye 1000 times", different_eyes(1_000, runs), "ratio", 2.0)
+    yield row("8 LEDs, behind spectacles / without", behind_spectacles(runs), "ratio", 8.0, 4.0)
     yield memory("E2")
     yield memory("E5")
     for name in EYES:
@@ -112,6 +115,26 @@ def different_eyes(count: int, runs: int) -> float:
             features(eyes, which, found.poses, place, scene.rig.cameras, zero, lights)
             best[name] = min(best.get(name, np.inf), time.process_time() - start)
     return best["different"] / best["same"]
+
+
+def behind_spectacles(runs: int) -> float:
+    """Cost of poses and features of 2,000 frames and eyes with eight LEDs behind lenses of -4 D over that without."""
+    data = load_scene("blignaut2014").spec.to_mapping()
+    angle = 2.0 * np.pi * np.arange(8) / 8.0
+    lights = np.column_stack([np.full(8, 560.0), 150.0 * np.cos(angle), 100.0 * np.sin(angle) - 250.0]).tolist()
+    data["rig"]["lights"] = [{"position_mm": place, "radius_mm": 2.5} for place in lights]
+    data["targets"] = {"grid": [40, 25]}
+    scenes = []
+    for lens in (None, {"sphere_d": -4.0}):
+        data["subject"]["spectacles"] = lens
+        scenes.append(Scene.of(SceneSpec.from_mapping(data)))
+    best = [np.inf, np.inf]
+    for _ in range(runs + 1):  # in turns
+        for k, scene in enumerate(scenes):
+            start = time.process_time()
+            trace(scene)
+            best[k] = min(best[k], time.process_time() - start)
+    return best[1] / best[0]
 
 
 def memory(name: str) -> Row:

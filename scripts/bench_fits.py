@@ -61,7 +61,7 @@ from eyerender.eye.batch import take_eyes
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.model import EyeModel
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_graph import Biconic
 from eyerender.optics.transforms import direction_of
 from eyerender.scene.observation import concatenate
 

@@ -46,7 +46,7 @@ print(json.dumps(found))
 """
 
 
-def aimed(targets_mm: Any, head_mm: Any, eye: int) -> Any:
+def aimed(targets_mm: Any, head_mm: Any, _torsion_rad: Any, eye: int) -> Any:
     """Turn a simple eye towards targets."""
     gap = targets_mm - head_mm - np.array([0.0, 31.5 if eye else -31.5, 0.0])
     return np.arctan2(gap[:, 1], gap[:, 0]), np.arctan2(gap[:, 2], np.hypot(gap[:, 0], gap[:, 1]))
@@ -85,7 +85,7 @@ def detected(
             right, missed = (right + 1, missed) if hit is not None else (right, missed + 1)
             used |= set() if hit is None else {hit}
         rest = [pair for k, pair in enumerate(found) if k not in used]
-        wrong += sum(np.linalg.norm(gaze[min(y, len(gaze) - 1)] - gaze[x]) >= 1.0 for x, y in rest)
+        wrong += sum(int(np.linalg.norm(gaze[min(y, len(gaze) - 1)] - gaze[x]) >= 1.0) for x, y in rest)
     return 2 * right / (2 * right + wrong + missed)
 
 
@@ -110,6 +110,23 @@ def scene_of(**sequence: Any) -> Any:
     data = {k: v for k, v in scene.spec.to_mapping().items() if k not in ("targets", "poses")}
     data["image"] = {**data["image"], "window_px": [320, 240]}
     return er.Scene.of(er.SceneSpec.from_mapping({**data, "sequence": sequence}))
+
+
+def rolling(renderer: Any) -> float:
+    """CPU time of frames that an eye crosses at 500 deg/s while rows are read for 10 ms, relative to a still eye."""
+    times = []
+    for speed, count in ((0.0, 12), (500.0, 3)):
+        ends = [-0.05, 0.25]
+        gaze = {"time_s": ends, "azimuth_deg": [speed * (t - 0.03) for t in ends], "elevation_deg": [0.0, 0.0]}
+        scene = scene_of(duration_s=0.2, gaze=gaze, lids={"blinks_per_minute": 0}, pupil={"hippus": 0}).with_(
+            {"rig.cameras.0.shutter": {"rolling": {"row_us": 10e3 / 480}}, "image.spp": 16, "sensor.exposure_ms": 4.0}
+        )
+        frames = scene.frames().take(slice(1, 1 + count))
+        for again in (False, True):
+            before = time.process_time()
+            list(er.render_windows(frames.take(slice(0, None if again else 2)), renderer=renderer))
+        times.append((time.process_time() - before) / count)
+    return times[1] / times[0]
 
 
 def costs(quick: bool) -> list[Row]:
@@ -139,6 +156,9 @@ def costs(quick: bool) -> list[Row]:
         row("CPU of a frame, pupil fixed / single frame", times["fixed"] / times["single"], "ratio", must=1.05),
         row("CPU of a frame, pupil moving / fixed", times["pupil"] / times["fixed"], "ratio", must=1.2),
     ]
+    rows.append(
+        row("CPU of a frame, rolling shutter of 10 ms at 500 deg/s / still", rolling(renderer), "ratio", must=4.0)
+    )
     desktop = er.load_scene("eyelink_desktop").spec.to_mapping()
     data = {k: v for k, v in desktop.items() if k not in ("targets", "poses")}
     data["subject"] = {**data.get("subject", {}), "eyes": ["right", "left"]}

@@ -142,7 +142,7 @@ def solved_deg(group: Any, survey: people.RigPopulation, axes: Any, noise: Featu
             moved = (np.arange(10) >= (0 if axis.before else 9))[:, None, None]
             pairs = ((other.outline_px, clean.outline_px), (other.glints_px, clean.glints_px))
             parts.append([np.where(moved, a, b) for a, b in pairs])
-        data[number] = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+        data[number] = (np.concatenate([one for one, _ in parts]), np.concatenate([one for _, one in parts]))
         fixed[number] = _tiled(seen, len(axes))
     unknowns = Unknowns.from_mapping(survey.unknowns)
     problem = Problem(

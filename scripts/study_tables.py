@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Renew the tables of docs/studies.md.
+"""Renew the tables of docs/studies.md and docs/studies_people.md.
 
     study_tables.py [FOLDER ...]
 
-Each folder is the result of a study (guestrin2006, blignaut2014, conditions). Its numbers go into
-docs/data/studies/results.json, where those of other studies and observers stay. Then every table between
-`<!-- table NAME -->` and `<!-- end -->` in docs/studies.md is written from that file. Without folders, only the page is
-written.
+Each folder is the result of a study. The numbers of eye models (guestrin2006, blignaut2014, conditions) go into
+docs/data/studies/results.json, those over people into people.json beside it, where the numbers of other studies and
+observers stay. Then every table between `<!-- table NAME -->` and `<!-- end -->` in the pages is written from these
+files. Without folders, only the pages are written.
 """
 
 from __future__ import annotations
@@ -23,11 +23,96 @@ from eyerender.apps.study import literature as lit
 
 ROOT = Path(__file__).parents[1]
 DATA, PAGE = ROOT / "docs/data/studies/results.json", ROOT / "docs/studies.md"
+PEOPLE_DATA, PEOPLE_PAGE = ROOT / "docs/data/studies/people.json", ROOT / "docs/studies_people.md"
 UNTESTED = ROOT / "docs/data/studies/untested_sentences.csv"
 MODELS = lit.MODELS
 READINGS = ("published", "corrected")
 HEADS, SETS, LISTED = ("H1", "H2"), tuple(lit.CALIBRATION_SETS), ("C5", "C9", "C135")
 KNOWN = ("guestrin2006", "blignaut2014", "conditions")
+
+
+# Table over people -> its columns: heading -> a key, or the keys of a mean and its interval.
+_MEAN = ("mean_deg", "low_deg", "high_deg")
+PEOPLE_COLUMNS: dict[str, dict[str, str | tuple[str, ...]]] = {
+    "people": {
+        "reading": "protocol", "observer": "observer", "condition": "condition", "people": "people",
+        "mean (95 % interval)": _MEAN, "SD": "sd_deg", "5 %": "p5_deg", "50 %": "p50_deg", "95 %": "p95_deg",
+        "U50E95": "U50E95", "images add": tuple(f"added_{key}" for key in _MEAN),
+        "experiment": ("measured_deg", "measured_low_deg", "measured_high_deg"), "verdict": "verdict",
+    },
+    "causes": {
+        "cause": "cause", "people": "people",
+        "adds to the rise (deg)": tuple(f"adds to the rise, deg_{end}" for end in ("mean", "low", "high")),
+    },
+    "sizes": {
+        "observer": "observer", "camera": "camera", "stop (mm)": "stop_mm", "correction": "correction",
+        "people": "people", "missing": "missing", "median (%)": "p50", "95th percentile (%)": ("p95", "low", "high"),
+    },
+    "straight_ahead": {
+        "camera": "camera", "stop (mm)": "stop_mm",
+        **{name: tuple(f"{name}_{end}" for end in ("mean", "low", "high"))
+           for name in ("over the stop", "over the entrance pupil")},
+        "per dioptre (%)": "percent per dioptre", "half interval": "half of its 95 % interval",
+    },
+    "artefacts": {
+        "camera": "camera", "cause": "cause", "mean (deg)": _MEAN, "least": "least_deg", "most": "most_deg",
+        "sizes of both eyes differ by": tuple(f"sizes_differ_{end}" for end in ("mean", "low", "high")),
+        "vergence": tuple(f"vergence_{end}" for end in ("mean", "low", "high")), "its SD": "vergence_sd",
+        "concentration": "concentration", "differs over targets": "pattern_deg",
+        "share of that": ("share", "share_low", "share_high"),
+    },
+}  # fmt: skip
+
+
+def people_of(folder: Path) -> dict[str, Any]:
+    """Extract what the page over people states from the files of a study; nothing if it had eye models only."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    kept = {name: summary[name] for name in PEOPLE_COLUMNS if summary.get(name)}
+    if not kept or summary["study"] == "rigs":
+        return {}
+    found = json.loads((folder / "findings.json").read_text(encoding="utf-8"))["findings"]
+    own = [{k: f[k] for k in ("id", "rule", "value", "threshold", "verdict", "detail")} for f in found]
+    return {summary["study"]: {**kept, "findings": own if summary["study"] not in KNOWN else []}}
+
+
+def people_tables(data: Mapping[str, Any]) -> dict[str, str]:
+    """Return every table over people by the name of its study and its own."""
+    out = {}
+    for study, found in data.items():
+        for name, rows in found.items():
+            if (study, name) == ("calibration", "people"):
+                out[f"{study} {name}"] = _calibrations(rows)
+            elif name != "findings":
+                # A page has no room for all stops.
+                rows = [
+                    r for r in rows if r.get("correction", "table of").startswith("table of") or r["stop_mm"] == 4.0
+                ]
+                columns = {h: k for h, k in PEOPLE_COLUMNS[name].items() if any(_cell(row, k) for row in rows)}
+                out[f"{study} {name}"] = table(list(columns), [[_cell(r, k) for k in columns.values()] for r in rows])
+            elif rows:
+                told = {True: "true", False: "**false**", None: ""}
+                body = [[f["id"], f["rule"], "-" if f["value"] is None else f"{f['value']:.3g}", f["threshold"],
+                         told[f["verdict"]], f["detail"]] for f in rows]  # fmt: skip
+                out[f"{study} findings"] = table(["id", "statement", "value", "threshold", "verdict", "detail"], body)
+    return out
+
+
+def _calibrations(rows: list[dict[str, Any]]) -> str:
+    """Format the errors of calibrations: a column for each number of targets."""
+    by: dict[tuple[str, ...], dict[str, str]] = {}
+    for row in rows:
+        rig, *estimator, targets, when = row["condition"].split(", ")
+        key = rig, ", ".join(estimator), when, str(row["people"])
+        by.setdefault(key, {})[targets] = _cell(row, _MEAN)
+    targets = list(dict.fromkeys(one for cells in by.values() for one in cells))
+    body = [[*key, *(cells.get(one, "-") for one in targets)] for key, cells in sorted(by.items())]
+    return table(["rig", "estimator", "", "people", *targets], body)
+
+
+def _cell(row: Mapping[str, Any], keys: str | tuple[str, ...]) -> str:
+    values = [row.get(key) for key in ((keys,) if isinstance(keys, str) else keys)]
+    texts = ["" if v is None else f"{v:.3f}" if isinstance(v, float) else str(v) for v in values]
+    return texts[0] if len(texts) == 1 or not all(texts) else f"{texts[0]} ({texts[1]} to {texts[2]})"
 
 
 def numbers_of(folder: Path) -> dict[str, Any]:
@@ -167,13 +252,20 @@ def page_with(text: str, found: Mapping[str, str]) -> str:
 def main() -> int:
     """Read folders, write data and page."""
     data = json.loads(DATA.read_text(encoding="utf-8")) if DATA.exists() else {}
+    people = json.loads(PEOPLE_DATA.read_text(encoding="utf-8")) if PEOPLE_DATA.exists() else {}
     for folder in map(Path, sys.argv[1:]):
+        if over_people := people_of(folder):
+            people |= over_people
+            continue
         for name, new in numbers_of(folder).items():
             old = data.get(name, {})
             means = {**old.get("means", {}), **new.get("means", {})}
             data[name] = {**old, **new, **({"means": means} if means else {})}
     DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(page_with(PAGE.read_text(encoding="utf-8"), tables(data)), encoding="utf-8")
+    PEOPLE_DATA.write_text(json.dumps(people, indent=1) + "\n", encoding="utf-8")
+    written = page_with(PEOPLE_PAGE.read_text(encoding="utf-8"), people_tables(people))
+    PEOPLE_PAGE.write_text(written, encoding="utf-8")
     return 0
 
 

@@ -1,7 +1,8 @@
-"""The documentation site: its references are complete, its pages are reachable, and their links resolve."""
+"""The documentation site, the examples of docstrings and of the page on Python, and the stored data."""
 
 from __future__ import annotations
 
+import doctest
 import importlib.util
 import json
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,7 +21,9 @@ from PIL import Image
 
 import eyerender as er
 from docs.tools import keys, references, validation
-from tests.support.paths import ROOT
+from eyerender.scene import Scene
+from eyerender.scene.spec import SceneSpec
+from tests.support.paths import DATA, ROOT
 
 DOCS = ROOT / "docs"
 GALLERY = "gallery/index"  # made by sphinx-gallery
@@ -62,10 +66,28 @@ def test_rows_state_unit_range_default_and_source():
 
 
 def test_a_record_is_described_once_and_links_lead_to_it(pages):
-    text = "".join(pages[f"generated/keys_{kind}"] for kind in keys.FILES)
-    anchors = re.findall(r"^\((keys-\w+)\)=$", text, re.MULTILINE)
-    assert len(anchors) == len(set(anchors)) > 40
-    assert set(re.findall(r"\(#(keys-\w+)\)", text)) <= set(anchors)
+    own = {page: re.findall(r"^\((keys-\w+)\)=$", pages[f"generated/{page}"], re.MULTILINE) for page in keys.BLOCKS}
+    everywhere = [name for names in own.values() for name in names]
+    assert len(everywhere) == len(set(everywhere)) > 90
+    for page in keys.BLOCKS:
+        for other, name in re.findall(r"\((?:(keys_\w+)\.md)?#(keys-\w+)\)", pages[f"generated/{page}"]):
+            assert name in own[other or page]
+
+
+@pytest.mark.parametrize("page", keys.BLOCKS)
+def test_the_example_of_a_page_of_keys_is_read(page):
+    block = keys.BLOCKS[page]
+    example = yaml.safe_load(block.example)
+    if "" not in block.paths:
+        whole = er.load_eye("E4").to_mapping() if block.kind == "eye" else er.load_scene("headset").spec.to_mapping()
+        if "sequence" in example:
+            del whole["targets"]
+        if "population" in example:
+            del whole["eye"], whole["region"]
+        example = {**whole, **example}
+    spec = keys.FILES[block.kind].from_mapping(example)
+    if block.kind == "scene":
+        assert len(Scene.of(cast(SceneSpec, spec)).frames()) > 0
 
 
 def test_every_public_name_has_a_docstring_page(pages):
@@ -76,16 +98,18 @@ def test_every_public_name_has_a_docstring_page(pages):
 
 
 def test_every_command_is_in_the_reference(pages):
-    text = pages["generated/commands"]
-    assert len(re.findall(r"^## eyerender ", text, re.MULTILINE)) > 15
-    assert "\neyerender render --output PATH [OPTIONS] SCENE\n" in text
+    texts = [pages[f"generated/{page}"] for page in references.COMMANDS]
+    assert len(re.findall(r"^## eyerender ", "".join(texts), re.MULTILINE)) > 25
+    assert all(text.count("**Examples**") == text.count("\n## eyerender ") for text in texts)
+    assert "\neyerender render --output PATH [OPTIONS] SCENE\n" in pages["generated/commands_scenes"]
 
 
 def test_every_page_is_in_a_table_of_contents(pages):
     listed = {"index", "generated/validation_tables", "generated/api_names"}  # the last two are included, no pages
     for text in pages.values():
         for body in re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL):
-            listed |= {line for line in body.splitlines() if line and not line.startswith(":")}
+            lines = (line for line in body.splitlines() if line and not line.startswith(":"))
+            listed |= {re.sub(r".*<(.+)>", r"\1", line).lstrip("/") for line in lines}
     assert set(pages) == listed - {GALLERY}
 
 
@@ -191,3 +215,75 @@ def test_a_drawing_of_the_pages_is_the_one_of_today(makers, name, tmp_path):
     )
     assert mine.shape == told.shape
     assert np.mean(np.abs(mine - told) > 64) < 1e-3  # fonts may differ by a little
+
+
+ROWS = [line for line in (DATA / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+
+
+def test_every_file_is_listed_once():
+    listed = [name for row in ROWS for name in re.findall(r"`([^`]+)`", row.split("|")[1])]
+    assert sorted(listed) == sorted(p.name for p in DATA.iterdir() if p.name != "README.md")
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: re.findall(r"`([^`]+)`", row)[0])
+def test_a_row_names_the_program_how_it_was_used_and_its_licence(row):
+    _, _, program, how, licence, _ = row.split("|")
+    assert all(cell.strip() for cell in (program, how, licence))
+
+
+SPACES = [getattr(er, name) for name in er.__all__ if isinstance(getattr(er, name), ModuleType)]
+FOUND = {name: getattr(er, name) for name in er.__all__ if name != "__version__"} | {
+    f"{space.__name__}.{name}": getattr(space, name) for space in SPACES for name in space.__all__
+}
+EXAMPLES = {name: one for name, one in FOUND.items() if ">>>" in (one.__doc__ or "")}
+
+
+def test_every_name_at_the_root_has_an_example():
+    assert [name for name in er.__all__ if name not in EXAMPLES and name in FOUND and FOUND[name] not in SPACES] == []
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_example_prints_what_it_says(name):
+    wanted = doctest.DocTestParser().get_doctest(EXAMPLES[name].__doc__, {"er": er, "np": np}, name, None, None)
+    output: list[str] = []
+    assert doctest.DocTestRunner().run(wanted, out=output.append).failed == 0, "".join(output)
+
+
+PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+
+
+def blocks():
+    return re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_every_name_on_the_page_exists():
+    names = set(re.findall(r"\ber\.((?:gaze\.)?\w+)", PAGE)) - {"gaze"}
+    assert len(names) > 20
+    for name in names:
+        found = er
+        for part in name.split("."):
+            found = getattr(found, part)
+    for name in re.findall(r"^\| `(\w+)\(", PAGE, re.MULTILINE):
+        assert hasattr(er.gaze, name)
+
+
+def test_the_example_of_statuses_runs(capsys):
+    (block,) = [block for block in blocks() if "er.Status" in block]
+    exec(block, {"er": er, "np": np})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "270 of 270 pupils"
+    assert lines[2:] == ["<Status.OK: 0> None"]
+
+
+def test_the_examples_of_gaze_run(capsys):
+    space: dict[str, Any] = {"er": er}
+    for block in blocks():
+        if "leave_one_target_out" in block or "class Middle" in block:
+            exec(block, space)
+    mean, largest = map(float, capsys.readouterr().out.split())
+    assert 0 < mean < largest < 5
+    middle = space["Middle"]().fit(space["truth"], space["scene"].rig)
+    again = type(middle).from_mapping(middle.to_mapping())
+    gaze = again.predict(space["truth"], space["scene"].rig)
+    assert gaze.ok.all()
+    assert gaze == middle.predict(space["truth"], space["scene"].rig)

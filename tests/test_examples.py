@@ -32,8 +32,7 @@ def small(source: str) -> str:
 
 @pytest.mark.render
 @pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, id=p.stem, marks=() if p.name[:2] in QUICK else pytest.mark.slow) for p in EXAMPLES],
+    "path", [pytest.param(p, id=p.stem, marks=() if p.name[:2] in QUICK else pytest.mark.slow) for p in EXAMPLES]
 )
 def test_the_example_runs_and_draws(path, tmp_path):
     script = tmp_path / path.name

@@ -66,11 +66,7 @@ def test_preview_shows_the_codes_as_they_are():
 
 
 def line(name="a"):
-    return {
-        "file_name": f"images/{name}.png",
-        "window_px": {"x0": 3, "y0": 4, "width": 5, "height": 6},
-        "records": [],
-    }
+    return {"file_name": f"images/{name}.png", "window_px": {"x0": 3, "y0": 4, "width": 5, "height": 6}, "records": []}
 
 
 def test_staged_folder_appears_complete(tmp_path):
@@ -115,11 +111,7 @@ def test_everything_is_synced_before_dataset_json_takes_its_place(tmp_path, monk
     [
         ("metadata.jsonl", None, "holds no metadata.jsonl"),
         ("metadata.jsonl", "", "holds no images"),
-        (
-            "metadata.jsonl",
-            "{}\n",
-            "line 1.schema: is None; this version reads 'eyerender/image/5'",
-        ),
+        ("metadata.jsonl", "{}\n", "line 1.schema: is None; this version reads 'eyerender/image/5'"),
         (
             "metadata.jsonl",
             json.dumps({"schema": "eyerender/image/5", **line(), "file_name": "../x"}),

@@ -18,6 +18,7 @@ from eyerender.scene.observation import (
     Observations,
     PoseTruth,
     PupilFeatures,
+    PurkinjeFeatures,
     concatenate,
 )
 
@@ -68,12 +69,7 @@ def observations(n: int = 4, seed: int = 0, points: int = 6, lights: int = 2) ->
             covariance=cov,
         ),
         glints=GlintFeatures(
-            status=g_status,
-            light=light,
-            reason=g_reason,
-            in_image=g_status == Status.OK,
-            xy_px=xy,
-            covariance=g_cov,
+            status=g_status, light=light, reason=g_reason, in_image=g_status == Status.OK, xy_px=xy, covariance=g_cov
         ),
     )
 
@@ -90,6 +86,27 @@ def test_records_come_back_through_json():
     before = observations()
     after = Observations.from_records(json.loads(json.dumps(list(before.records()), allow_nan=False)))
     assert_same(before, after)
+
+
+def test_purkinje_images_come_back_through_json():
+    seen = observations()
+    xy = np.random.default_rng(1).uniform(0, 900, (4, 3, 2))
+    status = np.full((4, 3), Status.OK)
+    status[1, 2], xy[1, 2] = Status.BEHIND_IRIS, np.nan
+    reason = np.full((4, 3), None, dtype=object)
+    reason[1, 2] = Status.BEHIND_IRIS.reason
+    images = PurkinjeFeatures(
+        status=status, light=np.tile([0, 0, 1], (4, 1)), reason=reason, in_image=status == Status.OK, xy_px=xy,
+        time_s=np.full((4, 3), 0.5), order=np.tile([2, 4, 4], (4, 1)),
+    )  # fmt: skip
+    before = replace(seen, purkinje=images)
+    records = json.loads(json.dumps(list(before.records()), allow_nan=False))
+    assert list(records[0]["purkinje"][0]) == ["order", "light", "status", "reason", "in_image", "xy_px", "time_s"]
+    assert Observations.from_records(records, complete=True).purkinje == images
+    assert concatenate([before, seen]).purkinje.take([1]) == images.take([1])
+    records[0]["purkinje"][1]["order"] = 5
+    with pytest.raises(InputError, match=r"purkinje\.1.*order"):
+        Observations.from_records(records)
 
 
 def test_record_has_every_key_and_null_where_it_does_not_apply():

@@ -9,6 +9,7 @@ import socket
 import pytest
 import yaml
 
+import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.base.spec import file_digest, parse_yaml, read_yaml
 from eyerender.cli.main import run
@@ -17,6 +18,7 @@ from eyerender.dataset.realise import frames_of
 from eyerender.dataset.spec import DatasetSpec, find_dataset, shipped_datasets
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.spec import EyeSpec
+from eyerender.rig.imaging import samples_for
 from eyerender.scene import load_scene, shipped_scenes
 from eyerender.scene.spec import SceneSpec
 
@@ -334,3 +336,14 @@ def test_decimal_numbers_and_quoted_text_are_read() -> None:
     assert parse_yaml("a: [0, 0.5, 10, -0.25, 1e-3, '010', \"66:40\"]\n", "f") == {
         "a": [0, 0.5, 10, -0.25, 1e-3, "010", "66:40"]
     }
+
+
+def test_samples_follow_the_blur_of_the_lens():
+    wanted = [samples_for(sigma) for sigma in (0.0, 0.3, 0.5, 0.7, 0.9, 1.8, 5.0)]
+    assert wanted == [32, 32, 32, 8, 4, 4, 4]
+    data = er.load_scene("headset").spec.to_mapping()
+    data["image"]["spp"] = "auto"
+    for sigma, spp in ((0.7, 8), (2.0, 4)):
+        data["sensor"]["psf_sigma_px"] = sigma
+        assert SceneSpec.from_mapping(data).image.spp == spp
+    assert er.sample("people_openeds", 0).scene.spec.image.spp == 4

@@ -119,3 +119,16 @@ def test_version_is_the_same_everywhere_and_its_changes_are_listed():
     releases = re.findall(r"^## (\S+) - (\d{4}-\d{2}-\d{2})$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert releases
     assert releases[0][0] == version
+
+
+@pytest.mark.render
+def test_the_notebook_runs_from_the_wheel(site, tmp_path):
+    """Its cells in their order, as one script; the lines for a hosted notebook are comments."""
+    folder, _, _ = site
+    notebook = json.loads((ROOT / "examples" / "first_notebook.ipynb").read_text(encoding="utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    script = tmp_path / "notebook.py"
+    script.write_text("import matplotlib\n\nmatplotlib.use('Agg')\n" + "\n\n".join(cells), encoding="utf-8")
+    done = run(folder, tmp_path, str(script))
+    assert done.returncode == 0, done.stderr
+    assert float(re.search(r"mean gaze error: ([\d.]+) deg", done.stdout)[1]) < 1.0

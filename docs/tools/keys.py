@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -214,36 +214,193 @@ def section(record: type[Spec], places: list[str], level: int = 2) -> str:
     """The section of one record: where it stands, what it is, and its table."""
     where = ", ".join(f"`{place}`" for place in places if place) or "the top of the file"
     lines = [f"({anchor(record)})=", f"{'#' * level} {record.__name__}", "", f"At {where}. {plain_doc(record)}", ""]
-    lines += ["| key | type | unit | range | default | what it is | source of the default |", "|---" * 7 + "|"]
+    lines += ["| key | value | what it is |", "|---|---|---|"]
     for row in rows_of(record):
-        cells = (f"`{row.key}`", row.kind, row.unit, row.range, row.default, row.description, row.source)
-        lines.append("| " + " | ".join(cell(text) for text in cells) + " |")
+        value = ", ".join(part for part in (cell(row.kind), row.unit, cell(row.range)) if part)
+        if row.default not in ("none", "empty"):
+            value += f"; {row.default}" if row.default.startswith("**") else f"; default {row.default}"
+        source = f" ({row.source})" if row.source else ""
+        lines.append(f"| `{row.key}` | {value} | {cell(row.description + source)} |")
     return "\n".join([*lines, "", ""])
 
 
 INTRODUCTION = """Lists may be written as YAML lists; an integer may stand for a number. `[]` in a path stands for an
 entry of a list. Lengths are in mm and angles in degrees unless a key ends in another unit. Unless a row says otherwise,
-numbers lie between -1e9 and 1e9. The last column says where a default comes from: "chosen" means that it was set by eye
-or lacks a published source, and "none stated" that the code names none. An empty cell means that there is no default,
-or that it is a convention or switches something off. [Conventions](../conventions.md) defines the frames."""
+numbers lie between -1e9 and 1e9. Parentheses at the end of a description say where a default comes from: "chosen" means
+that it was set by eye or lacks a published source, and "none stated" that the code names none.
+[Conventions](../conventions.md) defines the frames."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A page of keys: those of a kind of file that stand at some of its paths, with an example of them."""
+
+    kind: str
+    title: str
+    paths: tuple[str, ...]
+    example: str
+
+
+# Page of each block. A record stands on the page of the longest path that begins one of its own.
+BLOCKS = {
+    "keys_scene": Block("scene", "Keys of a scene file", ("",), """
+name: two lamps
+eye: {model: E4}
+rig:
+  cameras: [{position_mm: [500, 0, -200], look_at_mm: [0, 0, 0], focal_length_px: 6000, resolution_px: [1280, 960]}]
+  lights: [{position_mm: [500, 120, -200]}, {position_mm: [500, -120, -200]}]
+  screen: {centre_mm: [600, 0, 0], size_mm: [500, 300]}
+targets: {grid: [3, 3]}
+region: {seed: 1}
+"""),
+    "keys_subject": Block("scene", "Eyes and glasses", ("eye", "subject"), """
+eye: {model: E4, pupil_diameter_mm: 4}
+subject:
+  ipd_mm: 63
+  spectacles: {sphere_d: -3, cylinder_d: -1, axis_deg: 20}
+"""),
+    "keys_people": Block("scene", "People", ("population", "person"), """
+population: {preset: adults, seed: 0, subject: 5}
+"""),
+    "keys_rig": Block("scene", "Lamps, screen and what is in the way", ("rig",), """
+rig:
+  cameras: [{position_mm: [40, -38, -15], look_at_mm: [0, -31.5, 0], focal_length_px: 720, resolution_px: [640, 480]}]
+  lights: [{ring: {camera: 0, radius_mm: 13, count: 8}, radius_mm: 0.5, aim_mm: nearest_eye}]
+  screen: {centre_mm: [1000, 0, 0], size_mm: [960, 720]}
+"""),
+    "keys_cameras": Block("scene", "Cameras", ("rig.cameras[]",), """
+rig:
+  cameras:
+    - {position_mm: [500, 90, -200], look_at_mm: [0, 0, 0], focal_length_px: 6000, resolution_px: [1280, 960]}
+    - {position_mm: [500, -90, -200], look_at_mm: [0, 0, 0], focal_length_px: 6000, resolution_px: [1280, 960]}
+  lights: [{position_mm: [500, 0, -200]}]
+  screen: {centre_mm: [600, 0, 0], size_mm: [500, 300]}
+"""),
+    "keys_gaze": Block("scene", "Where the eyes look, and motion", ("targets", "poses", "motion"), """
+targets: {screen_mm: [[-100, 0], [0, 0], [100, 0]]}
+motion: {eye_deg_s: [100, 0]}
+"""),
+    "keys_sequence": Block("scene", "Sequences: eyes, lids, pupils and rigs in time", ("sequence",), """
+sequence:
+  duration_s: 2
+  lids: {blinks_per_minute: 20}
+  rig: {jumps_per_minute: 6, jump_mm: 0.5, jump_deg: 0.5}
+"""),
+    "keys_image": Block("scene", "The picture: window, sensor and lens", ("image", "sensor", "lens"), """
+image: {spp: 32, window_px: [320, 240]}
+sensor: {exposure_ms: 8, f_number: 2.8, psf_sigma_px: 1.2}
+lens: {glare: 0.05}
+"""),
+    "keys_look": Block("scene", "Iris, sclera and fundus", ("look",), """
+look: {iris_seed: 7, iris_albedo: 0.4}
+"""),
+    "keys_region": Block("scene", "Lids, lashes, brows and skin", ("region",), """
+region:
+  seed: 12
+  lids: {upper_follows: 0.9}
+  lashes: {diameter_mm: 0.1}
+  skin: {albedo: 0.5}
+"""),
+    "keys_light": Block("scene", "Ambient light", ("ambient",), """
+ambient:
+  irradiance_w_m2: 0.2
+  panels: [{centre_mm: [700, 400, 300], size_mm: [400, 600], radiance_w_m2_sr: 0.5}]
+"""),
+    "keys_eye": Block("eye", "Keys of an eye file", ("",), """
+format: 3
+name: my eye
+cornea:
+  - {name: anterior cornea, shape: {kind: conic, radius_mm: 7.8, conic_constant: -0.25}, medium: {index: 1.3375}}
+retina: {shape: {kind: sphere, radius_mm: -12}, position_mm: [-24, 0, 0]}
+stop: {diameter_mm: 4, position_mm: [-3.6, 0, 0]}
+limbus_radius_mm: 5.85
+iris: {root_radius_mm: 5.5}
+sclera: {radius_mm: 12}
+rotation: {azimuth_centre_mm: [-13.5, 0, 0], elevation_centre_mm: [-13.5, 0, 0]}
+fovea: {field_deg: [5.45, 2.5], distance_mm: 1500}
+"""),
+    "keys_surfaces": Block("eye", "Surfaces of eyes", ("cornea[]",), """
+cornea:
+  - shape: {kind: biconic, radii_mm: [7.8, 7.6], conic_constants: [-0.25, -0.2]}
+    name: anterior cornea
+    medium: {index: 1.376}
+  - {name: posterior cornea, shape: {kind: sphere, radius_mm: 6.5}, position_mm: [-0.55, 0, 0], medium: {index: 1.336}}
+"""),
+    "keys_dataset": Block("dataset", "Keys of a dataset file", ("",), """
+format: 3
+kind: dataset
+name: mine
+count: 400
+shard_size: 40
+subjects: 40
+splits: {train: 0.8, test: 0.2}
+population: {preset: adults}
+scene:
+  rig:
+    cameras: [{position_mm: [500, 0, -200], look_at_mm: [0, 0, 0], focal_length_px: 6000, resolution_px: [1280, 960]}]
+    lights: [{position_mm: [500, {draw: uniform, low: 60, high: 120}, -200]}, {position_mm: [500, -120, -200]}]
+    screen: {centre_mm: [600, 0, 0], size_mm: [500, 300]}
+  targets:
+    screen_mm: [[{draw: sobol, low: -250, high: 250}, {draw: sobol, low: -150, high: 150}]]
+  image: {window_px: [320, 240]}
+  region: {seed: {draw: integer, low: 0, high: 1000000}}
+"""),
+}  # fmt: skip
+
+
+def page_of(places: list[str], kind: str) -> str:
+    """The page on which a record stands that may stand at these places of a kind of file."""
+    fits = [
+        (len(path), page)
+        for page, block in BLOCKS.items()
+        if block.kind == kind
+        for path in block.paths
+        for place in places
+        if not path or place == path or place.startswith((f"{path}.", f"{path}["))
+    ]
+    return max(fits)[1]
 
 
 def pages() -> dict[str, str]:
-    """The three pages of keys by their names. A record that several files hold is described once."""
-    made: dict[str, str] = {}
-    described: set[type[Spec]] = set()
-    for name in ("eye", "scene", "dataset"):
-        root = FILES[name]
-        text = f"# Keys of {'an' if name == 'eye' else 'a'} {name} file\n\n{INTRODUCTION}\n\n"
-        text += f"`eyerender schema {name}` prints the same as a JSON Schema for editors.\n\n"
-        for record, places in records_of(root).items():
+    """The pages of keys by their names. A record that several files hold is described once."""
+    made = {page: head(block) for page, block in BLOCKS.items()}
+    described: dict[type[Spec], str] = {}
+    for kind in ("eye", "scene", "dataset"):
+        for record, places in records_of(FILES[kind]).items():
             if record not in described:
-                described.add(record)
-                text += section(record, places)
-        if name == "eye":
-            text += sources_of_eyes()
-        made[f"keys_{name}"] = text
-    return made
+                described[record] = page_of(places, kind)
+                made[described[record]] += section(record, places)
+    made["keys_eye"] += sources_of_eyes()
+    return {page: linked(text, page, described) for page, text in made.items()}
+
+
+def toctree(names: Iterable[str]) -> str:
+    """A hidden table of contents, which puts generated pages below the one that holds it."""
+    return "\n```{toctree}\n:hidden:\n" + "".join(f"/generated/{name}\n" for name in names) + "```\n"
+
+
+def head(block: Block) -> str:
+    """The head of a page: what holds for its keys, and an example."""
+    text = f"# {block.title}\n\n"
+    if "" in block.paths:
+        text += f"{INTRODUCTION}\n\n`eyerender schema {block.kind}` prints the same as a JSON Schema for editors.\n\n"
+        parts = {page: one.title for page, one in BLOCKS.items() if one.kind == block.kind and one != block}
+        if parts:
+            text += "Pages of their own:\n\n" + "".join(f"- [{its}]({page}.md)\n" for page, its in parts.items())
+            text += toctree(parts) + "\n"
+    else:
+        start = "keys_" + block.kind
+        text += f"Part of the [keys of {'an' if block.kind == 'eye' else 'a'} {block.kind} file]({start}.md)"
+        text += ", which says how to read the tables.\n\n"
+    return text + (f"```yaml{block.example}```\n\n" if block.example else "")
+
+
+def linked(text: str, page: str, described: dict[type[Spec], str]) -> str:
+    """The text of a page, whose links to records of other pages name these."""
+    others = {anchor(record): its for record, its in described.items() if its != page}
+    return re.sub(
+        r"\(#(keys-\w+)\)", lambda one: f"({others[one[1]]}.md#{one[1]})" if one[1] in others else one[0], text
+    )
 
 
 def sources_of_eyes() -> str:

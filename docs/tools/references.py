@@ -8,8 +8,10 @@ from pathlib import Path
 from types import ModuleType
 
 import eyerender as er
+from docs.tools.keys import toctree
 from eyerender.cli import main as _commands  # noqa: F401  (registers the commands)
 from eyerender.cli.app import app
+from eyerender.cli.examples import EXAMPLES
 
 # A page of the API: its title, and the beginnings of the modules (below the package) whose names it holds.
 GROUPS = {
@@ -49,16 +51,43 @@ TORCH = """# Datasets for PyTorch
 """
 
 
-def commands() -> str:
-    """The help of every command, as the application prints it."""
+# A page of commands: its title, and its commands.
+COMMANDS = {
+    "commands_scenes": (
+        "Scenes and pictures",
+        ("features", "render", "preview", "view", "eyes", "live", "schema", "export-scene", "quickstart"),
+    ),
+    "commands_datasets": ("Making datasets", ("generate", "sample", "status", "merge")),
+    "commands_inspect": ("Looking into datasets, and exports", ("validate", "inspect", "realism", "export-dataset")),
+    "commands_features": ("Features from pictures", ("extract", "compare", "bench-extractors")),
+    "commands_gaze": ("Gaze", ("gaze", "fit-eye", "budget")),
+    "commands_design": ("Rigs, people and studies", ("rig", "sweep", "population", "study")),
+    "commands_setup": ("Set-up", ("doctor", "setup-llvm")),
+}
+
+
+def commands() -> dict[str, str]:
+    """The pages of the commands: the help of each as the application prints it, and a page that lists them."""
     text = app.generate_docs(output_format="markdown")
     # Cyclopts names the program as it was started, which is here "python -m sphinx" or the like.
     text = re.sub(r"^(eyerender[\w -]*?) -m \w+", r"\1", text, flags=re.MULTILINE)
-    _, _, rest = text.partition("**Commands**:")
-    head = "# Commands\n\n`eyerender COMMAND --help` prints the same on a terminal. [Which command for which task]"
-    head += "(../which_command.md) helps to choose.\n"
     # A code block in a language that Pygments does not know would be a warning.
-    return head + rest.replace("```console", "```sh")
+    listed, *sections = re.split(r"^(?=## eyerender )", text.replace("```console", "```sh"), flags=re.MULTILINE)
+    summaries = dict(re.findall(r"^\* \[`([\w-]+)`\]\(.*?\): (.*)$", listed, re.MULTILINE))
+    helps = {section.split()[2]: section for section in sections}
+    made = {}
+    start = "# Commands\n\n`eyerender COMMAND --help` prints the same on a terminal. [Which command for which task]"
+    start += "(../which_command.md) helps to choose.\n"
+    for page, (title, names) in COMMANDS.items():
+        start += f"\n## {title}\n\n| command | what it does |\n|---|---|\n"
+        made[page] = f"# {title}: commands\n\nThe other [commands](commands.md).\n\n"
+        for name in names:
+            start += f"| [`{name}`]({page}.md#eyerender-{name}) | {summaries.pop(name)} |\n"
+            examples = [line for key, lines in EXAMPLES.items() if key.split()[0] == name for line in lines]
+            made[page] += helps[name] + "\n**Examples**:\n\n```sh\n" + "\n".join(examples) + "\n```\n\n"
+    if summaries:
+        raise ValueError(f"no page of commands holds {', '.join(summaries)}")
+    return {"commands": start + toctree(made), **made}
 
 
 def homes() -> dict[str, str]:
@@ -75,7 +104,7 @@ def homes() -> dict[str, str]:
 
 def pages() -> dict[str, str]:
     """The pages of the commands and of the API by their names."""
-    made = {"commands": commands(), "api_names": ""}
+    made = {**commands(), "api_names": ""}
     where = homes()
     for page, (title, _) in GROUPS.items():
         names = [name for name, its in where.items() if its == page]

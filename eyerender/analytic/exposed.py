@@ -27,14 +27,10 @@ _Traced = Callable[[Ints, Floats], Features]
 def at_own_times(
     seen: Features, index: Index, rig: RigGeometry, timings: tuple[FrameTimes, ...], traced: _Traced
 ) -> tuple[Features, Floats, Floats]:
-    """Replace features at the time of their frame by features at their own times.
+    """Replace features of n rows at the time of their frame by features at their own times.
 
-    Args:
-        seen: features of n rows at the time of their frames.
-        index: the rows.
-        rig: the rig.
-        timings: times of the frames of each camera.
-        traced: computes the features of rows (indices) at other times.
+    `timings` are the times of the frames of each camera; `traced` computes the features of rows (indices) at other
+    times.
 
     Returns:
         The features, the time of each pupil's centre (n,) and of each glint (n, m). A point whose row gets no light is

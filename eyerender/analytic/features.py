@@ -35,37 +35,21 @@ RigidMotions = tuple[Floats, Floats]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Features(ArrayValue):
-    """Features of n eyes in their cameras; pixels are full-sensor, NaN where the status is not OK.
+    """Features of n eyes in their cameras; pixels are full-sensor, NaN where the status is not OK."""
 
-    Attributes:
-        points_px: (n, k, 2) the pupil's boundary.
-        point_status: (n, k).
-        point_residual_mm: (n, k).
-        centre_px: (n, 2) centre of its direct least-squares ellipse.
-        semi_axes_px: (n, 2).
-        angle_rad: (n,).
-        ellipse_residual_px: (n,) deviation (rms) of the boundary from the ellipse.
-        anatomical_centre_px: (n, 2) image of the stop's centre.
-        point_in_image: (n, k).
-        glints_px: (n, m, p, 2) the p requested Purkinje images of each of m lights; the first one is the glint.
-        glint_status: (n, m, p).
-        glint_residual_mm: (n, m, p).
-        glint_in_image: (n, m, p).
-    """
-
-    points_px: Floats
-    point_status: Statuses
-    point_residual_mm: Floats
-    centre_px: Floats
-    semi_axes_px: Floats
-    angle_rad: Floats
-    ellipse_residual_px: Floats
-    anatomical_centre_px: Floats
-    point_in_image: Bools
-    glints_px: Floats
-    glint_status: Statuses
-    glint_residual_mm: Floats
-    glint_in_image: Bools
+    points_px: Floats  # (n, k, 2) the pupil's boundary
+    point_status: Statuses  # (n, k)
+    point_residual_mm: Floats  # (n, k)
+    centre_px: Floats  # (n, 2) centre of its direct least-squares ellipse
+    semi_axes_px: Floats  # (n, 2)
+    angle_rad: Floats  # (n,)
+    ellipse_residual_px: Floats  # (n,) deviation (rms) of the boundary from the ellipse
+    anatomical_centre_px: Floats  # (n, 2) image of the stop's centre
+    point_in_image: Bools  # (n, k)
+    glints_px: Floats  # (n, m, p, 2) the p requested Purkinje images of each of m lights; the first one is the glint
+    glint_status: Statuses  # (n, m, p)
+    glint_residual_mm: Floats  # (n, m, p)
+    glint_in_image: Bools  # (n, m, p)
 
     @property
     def pupil_status(self) -> Statuses:
@@ -89,39 +73,26 @@ class Features(ArrayValue):
 
 
 def features(
-    eyes: Sequence[EyeModel],
-    eye_index: npt.ArrayLike,
-    poses: Poses,
-    position_mm: npt.ArrayLike,
-    cameras: Sequence[PinholeCamera],
-    camera_index: npt.ArrayLike,
-    lights_mm: npt.ArrayLike,
+    eyes: Sequence[EyeModel],  # distinct eyes
+    eye_index: npt.ArrayLike,  # (n,) the eye of each row
+    poses: Poses,  # n poses
+    position_mm: npt.ArrayLike,  # (n, 3) unrotated apex in the world, including the head's displacement
+    cameras: Sequence[PinholeCamera],  # distinct cameras
+    camera_index: npt.ArrayLike,  # (n,) the camera of each row
+    lights_mm: npt.ArrayLike,  # (m, 3) in the world
     *,
-    lit: npt.ArrayLike = True,
-    boundary_points: int = 30,
+    lit: npt.ArrayLike = True,  # (n, m) whether a light lights the eye; if not, its images have status NONE
+    boundary_points: int = 30,  # number of boundary points, >= 6
+    # orders of the requested images of each light; one that an eye lacks has status MISSED
     purkinje: Sequence[int] = (1,),
+    # what hides features besides the eye itself. Light that enters the eye is followed from its lamp to the point where
+    # it leaves.
     occluders: Occluders | None = None,
-    stops: Stop | None = None,
+    stops: Stop | None = None,  # n stops in place of those of the eyes
+    # n rotations and translations x' = R x + t that move cameras, lights and occluders in the world
     rig_motion: RigidMotions | None = None,
 ) -> Features:
-    """Compute the features of n eyes.
-
-    Args:
-        eyes: distinct eyes.
-        eye_index: (n,) the eye of each row.
-        poses: n poses.
-        position_mm: (n, 3) unrotated apex in the world, including the head's displacement.
-        cameras: distinct cameras.
-        camera_index: (n,) the camera of each row.
-        lights_mm: (m, 3) in the world.
-        lit: (n, m) whether a light lights the eye; if not, its images have status NONE.
-        boundary_points: number of boundary points, >= 6.
-        purkinje: orders of the requested images of each light; one that an eye lacks has status MISSED.
-        occluders: what hides features besides the eye itself. Light that enters the eye is followed from its lamp to
-            the point where it leaves.
-        stops: n stops in place of those of the eyes.
-        rig_motion: n rotations and translations x' = R x + t that move cameras, lights and occluders in the world.
-    """
+    """Compute the features of n eyes."""
     _check_options(len(np.atleast_1d(eye_index)), boundary_points, purkinje)
     which = np.asarray(eye_index, dtype=np.intp)
     cams = np.asarray(camera_index, dtype=np.intp)
@@ -204,11 +175,7 @@ def _stopped(eye: EyeModel, stops: Stop | None, rows: Indices) -> EyeModel:
 
 
 def _check_options(rows: int, boundary_points: int, purkinje: Sequence[int]) -> None:
-    """Check the options of `features` for this number of rows.
-
-    Raises:
-        InputError: an option is out of range.
-    """
+    """Raise InputError if an option of `features` is out of range."""
     if boundary_points < 6:
         raise InputError("must be >= 6", path="boundary_points")
     if boundary_points > MAX_BOUNDARY_POINTS:

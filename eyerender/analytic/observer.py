@@ -20,7 +20,6 @@ from ..rig.imaging import Opening
 from ..rig.rig import RigGeometry, RigLike
 from ..rig.timing import FrameTimes
 from ..scene.observation import (
-    EYES,
     SURFACES,
     GlintFeatures,
     Index,
@@ -28,6 +27,7 @@ from ..scene.observation import (
     Observations,
     PoseTruth,
     PupilFeatures,
+    PurkinjeFeatures,
 )
 from .exposed import at_own_times
 from .features import Features, RigidMotions, features
@@ -50,6 +50,11 @@ class TraceableScene(Protocol):
     @property
     def eye_name(self) -> str:
         """Name of the eye file, for messages."""
+        ...
+
+    @property
+    def further_purkinje(self) -> tuple[int, ...]:
+        """Orders of the mirror images of the lamps that pictures show besides the glints."""
         ...
 
     @property
@@ -137,14 +142,15 @@ class AnalyticObserver:
         return self.observe_in_detail(frames, rig)[0]
 
     def observe_in_detail(
-        self, frames: Traceable, rig: RigLike | None = None, *, purkinje: Sequence[int] = (1,)
+        self, frames: Traceable, rig: RigLike | None = None, *, purkinje: Sequence[int] = ()
     ) -> tuple[Observations, Features]:
         """Observe with residuals, the pupil's deviation from an ellipse, and Purkinje images.
 
         Args:
             frames: n frames.
             rig: replaces the rig of the frames.
-            purkinje: orders of the Purkinje images, from 1 (the glint) to 4.
+            purkinje: orders of the Purkinje images to report, from 1 (the glint) to 4, besides those of the scene's
+                pictures.
 
         Returns:
             The observations, and the detailed features, which records do not contain.
@@ -163,12 +169,14 @@ class AnalyticObserver:
                 f"must be among {', '.join(map(str, has))}: {scene.eye_name} has no other Purkinje images",
                 path="purkinje",
             )
-        seen = self._traced(frames, purkinje)
+        shown = sorted({*purkinje} | ({*scene.further_purkinje} & {*has}))
+        orders = (1, *(order for order in shown if order > 1))
+        seen = self._traced(frames, orders)
         pupil_s = np.full(len(index), np.nan)
         glint_s = np.full(seen.glint_status.shape[:2], np.nan)
         if len(index) and np.isfinite(index.start_s).all():
             seen, pupil_s, glint_s = at_own_times(
-                seen, index, scene.rig, scene.timings, lambda rows, at: self._traced(frames.at(rows, at), purkinje)
+                seen, index, scene.rig, scene.timings, lambda rows, at: self._traced(frames.at(rows, at), orders)
             )
         observed = Observations(
             index=index,
@@ -177,8 +185,13 @@ class AnalyticObserver:
             glints=replace(glint_features(seen), time_s=glint_s),
             lens_glints=lens_glint_features(scene, eyes, which, index),
             ghost_glints=ghost_glint_features(scene.rig, eyes, which, index, pose, scene.rig_motions(index)),
+            purkinje=purkinje_features(seen, glint_s, orders, shown) if shown else None,
         )
         return observed, seen
+
+    def at_instants(self, frames: Traceable) -> Features:
+        """Compute pupils and glints at the times of frames, whatever the shutters of their cameras."""
+        return self._traced(frames, (1,))
 
     def _traced(self, frames: Traceable, purkinje: Sequence[int]) -> Features:
         """Compute the features of rows at the times of their frames."""
@@ -194,7 +207,7 @@ class AnalyticObserver:
             np.array([light.position_mm for light in scene.rig.lights]),
             lit=scene.rig.lit(index.eye),
             boundary_points=self.boundary_points,
-            purkinje=(1, *sorted(set(purkinje) - {1})),
+            purkinje=purkinje,
             occluders=Occluders.of(scene.rig, scene.openings) if self.occluded else None,
             stops=scene.stops_of(index),
             rig_motion=scene.rig_motions(index),
@@ -225,28 +238,30 @@ def trace(
     return AnalyticObserver(boundary_points, occluded).observe(posed, rig)
 
 
-def purkinje_records(observed: Observations, seen: Features, orders: Sequence[int]) -> list[dict[str, Any]]:
-    """Convert Purkinje images to records: frame, eye, light, image (1 to 4), status, reason, in_image, xy_px."""
-    index = observed.index
-    out = []
-    for i, j, p in np.ndindex(seen.glint_status.shape):
-        status = Status(int(seen.glint_status[i, j, p]))
-        if status == Status.NONE:
-            continue
-        ok = status == Status.OK
-        out.append(
-            {
-                "frame": int(index.frame[i]),
-                "eye": EYES[int(index.eye[i])],
-                "light": j,
-                "image": orders[p],
-                "status": status.label,
-                "reason": status.reason,
-                "in_image": bool(seen.glint_in_image[i, j, p]) if ok else None,
-                "xy_px": seen.glints_px[i, j, p].tolist() if ok else None,
-            }
-        )
-    return out
+def purkinje_features(seen: Features, glint_s: Floats, orders: Sequence[int], shown: Sequence[int]) -> PurkinjeFeatures:
+    """Compute the Purkinje images of the orders `shown`, lamp by lamp, from features of `orders`.
+
+    The times are those of the lamps' glints, `glint_s` (n, lights): all images of a lamp are a few rows apart.
+    """
+    n, m, _ = seen.glint_status.shape
+    slots = [orders.index(order) for order in shown]
+
+    def each(values: Any) -> Any:
+        return values[:, :, slots].reshape(n, m * len(slots), *values.shape[3:])
+
+    status = each(seen.glint_status)
+    reasons = np.full(status.shape, None, dtype=object)
+    for i, j in np.argwhere((status != Status.OK) & (status != Status.NONE)):
+        reasons[i, j] = Status(status[i, j]).reason
+    return PurkinjeFeatures(
+        status=status,
+        light=np.where(status == Status.NONE, -1, np.repeat(np.arange(m), len(slots))),
+        reason=reasons,
+        in_image=each(seen.glint_in_image) & (status == Status.OK),
+        xy_px=each(seen.glints_px),
+        time_s=np.where(status == Status.OK, np.repeat(glint_s, len(slots), axis=1), np.nan),
+        order=np.broadcast_to(np.tile(shown, m), status.shape),
+    )
 
 
 def pupil_features(seen: Features) -> PupilFeatures:
@@ -345,9 +360,10 @@ def lens_glint_features(
         return None
     places = index.eye_position_mm + index.head_mm
     moved = np.nan_to_num(np.concatenate([index.rig_rotation_rad, index.rig_translation_mm], axis=1))
-    keys, rows, back = np.unique(
-        np.column_stack([index.camera, which, places, moved]), axis=0, return_index=True, return_inverse=True
-    )
+    keys: dict[bytes, int] = {}
+    table = np.column_stack([index.camera, which, places, moved])
+    back = np.array([keys.setdefault(key.tobytes(), len(keys)) for key in table], dtype=np.intp)
+    rows = np.unique(back, return_index=True)[1]
     rigs = [scene.rig_at(index, int(row)) for row in rows]
     found = [
         _images_of(rig, eyes[which[row]], int(index.eye[row]), int(index.camera[row]), places[row])
@@ -368,7 +384,7 @@ def lens_glint_features(
     whole = LensGlintFeatures(
         status=status, light=light, reason=reason, in_image=inside, xy_px=xy, surface=surface, index=number
     )
-    return whole.take(back.reshape(-1))
+    return whole.take(back)
 
 
 def _images_of(rig: RigGeometry, eye: EyeModel, side: int, camera: int, place_mm: Floats) -> list[LensImage]:

@@ -33,23 +33,15 @@ class Occluders:
 
     def mark(
         self,
-        status: Statuses,
-        pixels: Floats,
-        points_mm: Floats,
-        camera: PinholeCamera,
-        lights_mm: Floats | None,
+        status: Statuses,  # of the features
+        pixels: Floats,  # their places in the camera's picture
+        points_mm: Floats,  # (n, k, 3) where their light leaves the eyes, or the lenses before them, in the world
+        camera: PinholeCamera,  # the camera
+        lights_mm: Floats | None,  # (k, 3) the light of each glint; None for other features
+        # (n, k, 3) where the light arrives on the corneas; default: `points_mm`. Its way there is straight.
         lit_mm: Floats | None = None,
     ) -> None:
-        """Mark, in place, the status of hidden features (n, k), and set their pixels (n, k, 2) to NaN.
-
-        Args:
-            status: of the features.
-            pixels: their places in the camera's picture.
-            points_mm: (n, k, 3) where their light leaves the eyes, or the lenses before them, in the world.
-            camera: the camera.
-            lights_mm: (k, 3) the light of each glint; None for other features.
-            lit_mm: (n, k, 3) where the light arrives on the corneas; default: `points_mm`. Its way there is straight.
-        """
+        """Mark, in place, the status of hidden features (n, k), and set their pixels (n, k, 2) to NaN."""
         if self.bodies:
             tree = tree_of(*self.bodies)
             mark(status, tree.blocks(camera.nodal_point_mm, points_mm), Status.BEHIND_OBSTACLE)

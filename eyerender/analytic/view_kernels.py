@@ -14,14 +14,8 @@ def see_all(
 ) -> None:
     """Compute the motions from the eyes' frames to a camera's frame, and the camera's position in each eye's frame.
 
-    Args:
-        turn: (n, 3, 3) rotation of each eye.
-        shift: (n, 3) its translation to the world, mm.
-        R: (3, 3) world to camera.
-        t: (3,) mm.
-        rotation: (n, 3, 3), written.
-        translation: (n, 3) mm, written.
-        camera_mm: (3, n) nodal point, written.
+    Eyes turn by `turn` (n, 3, 3) and move by `shift` (n, 3) mm to the world; R and t (mm) lead from there to the
+    camera. `rotation` (n, 3, 3), `translation` (n, 3) and the nodal point `camera_mm` (3, n) are written.
     """
     for i in range(len(turn)):
         for row in range(3):
@@ -52,16 +46,8 @@ def project_all(
 ) -> None:
     """Project points (n, k) of each eye's frame to pixels f_x X/Z + c_x, f_y Y/Z + c_y; NaN where the status is not 0.
 
-    Args:
-        rotation: (n, 3, 3) eye to camera.
-        translation: (n, 3) mm.
-        x: (n, k).
-        y: (n, k).
-        z: (n, k).
-        status: (n, k), set to `behind` where a point with status 0 is not in front of the camera.
-        scale: f_x, c_x, f_y, c_y.
-        behind: a status.
-        out: (n, k, 2), written.
+    Rotation and translation are those of `see_all`; `scale` is f_x, c_x, f_y, c_y. `status` (n, k) is set to `behind`
+    where a point with status 0 is not in front of the camera; `out` (n, k, 2) is written.
     """
     for i in range(x.shape[0]):
         r, t = rotation[i], translation[i]

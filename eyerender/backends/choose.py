@@ -19,10 +19,9 @@ from typing import Literal
 from ..base.errors import BackendError, InputError
 from ..base.storage.cachefolder import cache_folder, private_folder
 from ..base.versions import package_version
-from .libraries import load_runtime
+from .libraries import CUDA_FIX, load_runtime
 from .llvm import ensure_llvm, select_llvm
 from .probe import Verdict, cpu_name, probe
-from .remedies import CUDA_FIX
 
 BackendName = Literal["cuda", "llvm"]
 BackendChoice = Literal["auto", "cuda", "llvm"]

@@ -10,9 +10,9 @@ from ..base.processes import usable_cpus
 from ..base.storage.cachefolder import cache_folder
 from ..base.versions import package_version
 from .choose import BackendName, BackendState, cuda_state
+from .libraries import llvm_fix
 from .llvm import find_llvm
 from .probe import cpu_name
-from .remedies import llvm_fix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,9 +19,8 @@ from pathlib import Path
 
 from ..base.errors import BackendError
 from ..base.processes import run
-from .libraries import load_llvm, wheel_libraries
+from .libraries import llvm_fix, load_llvm, wheel_libraries
 from .probe import Verdict, probe
-from .remedies import llvm_fix
 
 VARIANT = "llvm_ad_mono"
 ENVIRONMENT = "DRJIT_LIBLLVM_PATH"

@@ -40,17 +40,11 @@ _VERDICT_BYTES = 2**20
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Outcome of a probe.
+    """Outcome of a probe."""
 
-    Attributes:
-        ok: whether the backend renders.
-        detail: the reason why not, or what was found (LLVM's version, the GPU's name).
-        lasting: False for a reason that may disappear without a change of the library: a missing dependency, a
-            time-out.
-    """
-
-    ok: bool
-    detail: str
+    ok: bool  # whether the backend renders
+    detail: str  # the reason why not, or what was found (LLVM's version, the GPU's name)
+    # False for a reason that may disappear without a change of the library: a missing dependency, a time-out
     lasting: bool = True
 
 

@@ -84,21 +84,13 @@ _LOCK = threading.Lock()  # lock of `ensure_compiled`
 
 
 class Program(NamedTuple):
-    """Functions that are compiled together.
+    """Functions that are compiled together."""
 
-    Attributes:
-        title: its name in messages.
-        about_s: compilation time on two cores in seconds, for the message.
-        packages: packages of its modules.
-        module: module that imports them all; run as a script, it compiles a share of them.
-        complete: file in FOLDER whose existence means that all functions are compiled.
-    """
-
-    title: str
-    about_s: int
-    packages: tuple[str, ...]
-    module: str
-    complete: str
+    title: str  # its name in messages
+    about_s: int  # compilation time on two cores in seconds, for the message
+    packages: tuple[str, ...]  # packages of its modules
+    module: str  # module that imports them all; run as a script, it compiles a share of them
+    complete: str  # file in FOLDER whose existence means that all functions are compiled
 
 
 EXTRACTOR = Program("the extractor", ABOUT_S, ("eyerender.extraction",), "eyerender.extraction.compile", "complete")
@@ -142,15 +134,10 @@ def _compile_missing(program: Program) -> None:
 
 
 def compile_share(claims: Path, worker: int, program: Program = EXTRACTOR) -> None:
-    """Compile the functions of a program, except those that other processes claimed.
+    """Compile the functions of a program, except those that other processes claimed by a subfolder of `claims`.
 
     Functions of one module share helpers, which every process has to compile for itself. So workers with even numbers
     begin with the modules of glints and those with odd numbers with the pupil's, the largest module first.
-
-    Args:
-        claims: folder in which a process claims a function by creating a subfolder of the function's name.
-        worker: number of this process.
-        program: what is compiled.
     """
 
     def place(function: Any) -> tuple[bool, int, str]:

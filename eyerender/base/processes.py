@@ -135,13 +135,8 @@ def process_pool(
     """Open a pool of new processes; forked ones would inherit threads of other libraries in a broken state.
 
     Ctrl-C reaches the whole group of processes, so the children never see it and this process decides. When the caller
-    fails or is interrupted, the children end at once, whatever they are doing.
-
-    Args:
-        processes: their number.
-        initializer: called in each of them first.
-        alone: whether they do without the caller's script (`caller_hidden`), and with one thread for numerical
-            libraries.
+    fails or is interrupted, the children end at once, whatever they are doing. Those that are `alone` do without the
+    caller's script (`caller_hidden`), and with one thread for numerical libraries.
     """
     before = active_children()
     with ProcessPoolExecutor(processes, mp_context=spawning(), initializer=initializer) as pool:
@@ -176,18 +171,10 @@ def mapper(
 
 
 def ordered(job: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
-    """Yield `job(task)` of each task in the order of the tasks.
+    """Yield `job(task)` of each task in the order of the tasks; it raises what the job does for the first that fails.
 
     With one worker, this process does each task when its result is requested. Otherwise a few tasks per process are
-    fetched ahead, so that neither tasks nor results fill the memory.
-
-    Args:
-        job: can be pickled with all that it holds, and so can the tasks and the results.
-        tasks: are fetched as results are requested.
-        workers: number of processes.
-
-    Raises:
-        Exception: what the job raises for the first task that fails.
+    fetched ahead, so that neither tasks nor results fill the memory. All of them can be pickled.
     """
     if workers <= 1:
         yield from map(job, tasks)

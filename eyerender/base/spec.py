@@ -124,11 +124,7 @@ class Spec(BaseModel):
 
     @classmethod
     def from_mapping(cls, data: object, *, source: str = "") -> Self:
-        """Validate a plain mapping.
-
-        Raises:
-            InputError: naming `source` and the path of the first wrong key.
-        """
+        """Validate a plain mapping; InputError naming `source` and the path of the first wrong key."""
         if not isinstance(data, Mapping):
             raise InputError("must be a mapping of keys to values", source=source)
         return cls._validated(data, source=source)
@@ -274,11 +270,7 @@ class FileSpec(Spec):
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read a YAML file as a mapping, safely.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Read a YAML file as a mapping, safely; InputError if it cannot be read."""
     return parse_yaml(read_text(path, limit=MAX_YAML_BYTES), str(path))
 
 
@@ -312,11 +304,7 @@ def parse_yaml(text: str, source: str, *, mapping_tags: tuple[str, ...] = ()) ->
 
 
 def file_digest(path: Path, *, limit: int = MAX_FILE_BYTES) -> str:
-    """Compute the SHA-256 of a regular file's bytes, at most `limit`.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Compute the SHA-256 of a regular file's bytes, at most `limit`; InputError if it cannot be read."""
     with opened(path, limit=limit) as file:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()

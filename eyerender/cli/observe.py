@@ -46,13 +46,14 @@ def features(
 
     Args:
         points: Number of boundary points of the pupil.
-        purkinje: Add these Purkinje images (1 to 4) and the deviation of the pupil from an ellipse to the JSON.
+        purkinje: Add these Purkinje images (1 to 4) to the records, and the deviation of the pupil from an ellipse to
+            the JSON.
         output: With --rate: the file of the trace, or the folder of bids.
         format: With --rate: a table (csv), EyeLink's text form (asc), or a folder of BIDS eye tracking (bids).
         screen_px: With --format asc or bids: width and height of the screen in pixels.
     """
     # `observers` would load OpenCV, which is not needed here.
-    from ..analytic.observer import AnalyticObserver, purkinje_records
+    from ..analytic.observer import AnalyticObserver
     from ..imaging.labels import space_labels
 
     if points < 6:
@@ -72,7 +73,7 @@ def features(
         emit(trace, f"{output}: {trace['rows']} samples, {tracker.rate:g} per second", json, heed)
         return 0
     frames = loaded.frames()
-    observed, seen = AnalyticObserver(points).observe_in_detail(frames, purkinje=purkinje or (1,))
+    observed, seen = AnalyticObserver(points).observe_in_detail(frames, purkinje=purkinje or ())
     data: dict[str, Any] = {
         "schema": "eyerender/features/1",
         "rig": loaded.rig.to_mapping(),
@@ -80,7 +81,6 @@ def features(
         "space": space_labels(frames, observed) if json is not None else [],
     }
     if purkinje:
-        data["purkinje"] = purkinje_records(observed, seen, (1, *sorted(set(purkinje) - {1})))
         data["non_ellipticity_px"] = [float(v) if np.isfinite(v) else None for v in seen.ellipse_residual_px]
     emit(data, _feature_table(observed), json, heed)
     return 0

@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def at_least_one(_type: Any, value: float | None) -> None:
-    """Check that a given count is at least 1.
-
-    Raises:
-        ValueError: the count is below 1.
-    """
+    """Check that a given count is at least 1; ValueError if the count is below 1."""
     if value is not None and value < 1:
         raise ValueError(f"must be >= 1, not {value}")
 
@@ -87,11 +83,7 @@ class EstimatorFlags:
     fixations: str | None = None
 
     def choose(self, name: str) -> GazeEstimator:
-        """Create the estimator, not calibrated.
-
-        Raises:
-            InputError: there is no such estimator, or an option is wrong.
-        """
+        """Create the estimator, not calibrated; InputError if there is no such estimator, or an option is wrong."""
         from ..gaze.store import choose_estimator
 
         if (self.terms_x is None) != (self.terms_y is None):

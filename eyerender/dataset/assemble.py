@@ -170,10 +170,7 @@ class PackedTable:
 def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
     """Describe each damaged file among dataset.json and the assembled files whose checksums it contains.
 
-    Args:
-        folder: the dataset.
-        digest: digest of the plan that the dataset must have; None: any plan.
-        quick: compare sizes only.
+    The dataset must have the plan of this digest, if given; `quick` compares sizes only.
     """
     try:
         dataset = read_json(folder / DATASET, limit=MAX_FILE_BYTES, follow=False)
@@ -192,12 +189,7 @@ def damage(folder: Path, digest: str | None = None, *, quick: bool = False) -> I
 def verify_dataset(folder: Path, *, quick: bool = False, progress: Progress | None = None) -> Iterator[str]:
     """Describe each damaged file of a dataset: the results of `damage`, of `verify` for its shards, and missing shards.
 
-    Of an unfinished run, only the finished shards are verified.
-
-    Args:
-        folder: the dataset.
-        quick: compare sizes only.
-        progress: called with shards verified, shards in all and "shards".
+    Of an unfinished run, only the finished shards are verified. `quick` compares sizes only.
     """
     is_whole, there = (folder / DATASET).is_file(), sorted(finished(folder))
     if is_whole:

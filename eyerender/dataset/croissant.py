@@ -44,9 +44,7 @@ _CONTEXT = Path(__file__).parent / "data" / "croissant_context.json"  # terms of
 def croissant(plan: Plan, sums: Mapping[str, str]) -> dict[str, Any]:
     """Return the Croissant description as JSON-LD.
 
-    Args:
-        plan: the plan of the dataset.
-        sums: SHA-256 of the table of images and, in a packed dataset, of each shard's tar, by name.
+    `sums` are the SHA-256, by name, of the table of images and, in a packed dataset, of each shard's tar.
     """
     spec = plan.spec
     name = "".join(c if c.isalnum() else "_" for c in spec.name)
@@ -68,10 +66,9 @@ def croissant(plan: Plan, sums: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _file(name: str, sha256: str) -> dict[str, Any]:
-    words, encoding = {
-        METADATA: (_LINES, "application/jsonlines"),
-        INDEX: (_INDEX, "application/octet-stream"),
-    }.get(name, ("The pictures of a shard.", "application/x-tar"))
+    words, encoding = {METADATA: (_LINES, "application/jsonlines"), INDEX: (_INDEX, "application/octet-stream")}.get(
+        name, ("The pictures of a shard.", "application/x-tar")
+    )
     own = {"@type": "cr:FileObject", "@id": name, "name": name, "description": words, "contentUrl": name}
     return {**own, "encodingFormat": encoding, "sha256": sha256}
 

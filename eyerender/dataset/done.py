@@ -32,23 +32,14 @@ from ..folders.packed import INDEX, LINES_GZ
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FolderLayout:
-    """Names in a dataset's folder: each picture a file, or packed shards.
+    """Names in a dataset's folder: each picture a file, or packed shards."""
 
-    Attributes:
-        run: schema of run.json.
-        dataset: schema of dataset.json.
-        shard: schema of a shard's done.json.
-        table: assembled file of all images.
-        lines: file of a shard's metadata.
-        kinds: kinds of pictures whose folders hold files of a shard.
-    """
-
-    run: str
-    dataset: str
-    shard: str
-    table: str
-    lines: str
-    kinds: tuple[str, ...]
+    run: str  # schema of run.json
+    dataset: str  # schema of dataset.json
+    shard: str  # schema of a shard's done.json
+    table: str  # assembled file of all images
+    lines: str  # file of a shard's metadata
+    kinds: tuple[str, ...]  # kinds of pictures whose folders hold files of a shard
 
 
 FILES = FolderLayout(
@@ -110,11 +101,7 @@ _DONE_KEYS: dict[str, Callable[[Any], bool]] = {
 
 
 def read_done(folder: Path, shard: int) -> dict[str, Any]:
-    """Read a finished shard's done.json and check the type of every key.
-
-    Raises:
-        InputError: the file is not valid.
-    """
+    """Read a finished shard's done.json and check the type of every key; InputError if the file is not valid."""
     return read_done_file(folder / SHARDS / shard_name(shard) / DONE)
 
 

@@ -144,11 +144,7 @@ class MixtureDraw(_Draw):
     components: Annotated[tuple[Any, ...], Field(min_length=1)]
 
     def as_choice(self) -> ChoiceDraw:
-        """Return the choice of the components.
-
-        Raises:
-            InputError: a component is not a draw, or has no weight.
-        """
+        """Return the choice of the components; InputError if a component is not a draw, or has no weight."""
         data: dict[str, Any] = {MARK: "choice", "values": [], "weights": []}
         for k, component in enumerate(self.components):
             if not is_draw(component) or "weight" not in component:
@@ -248,11 +244,7 @@ def is_draw(node: object) -> bool:
 
 
 def parse_draw(node: dict[str, Any], *, source: str, path: str) -> Draw:
-    """Parse a node of a template as a distribution.
-
-    Raises:
-        InputError: with the path of the wrong key.
-    """
+    """Parse a node of a template as a distribution; InputError with the path of the wrong key."""
     kind: type[Draw | MixtureDraw] | None = MixtureDraw if node[MARK] == "mixture" else _KINDS.get(str(node[MARK]))
     if node[MARK] == "table":
         raise InputError("a table is read with the file of a spec; give its rows as a choice", source=source, path=path)

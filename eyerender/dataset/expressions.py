@@ -46,11 +46,7 @@ def is_reference(node: object) -> bool:
 
 
 def names_of(text: str) -> set[str]:
-    """Return the names of the variables in an expression.
-
-    Raises:
-        InputError: the text is not such an expression.
-    """
+    """Return the names of the variables in an expression; InputError if the text is not such an expression."""
     tree, _ = _parsed(text)
     functions = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and id(node) not in functions}

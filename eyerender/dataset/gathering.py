@@ -21,13 +21,8 @@ EXTENDS = "extends"
 def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -> dict[str, Any]:
     """Merge the mapping of a spec into the one that it extends; only mappings are merged, other values are replaced.
 
-    So are splits: their shares are one distribution.
-
-    Args:
-        data: the mapping.
-        file_of: returns the file of a spec, given its path or the name of a shipped one.
-        folder: folder of the spec. Names of other files in either spec are relative to it.
-        depth: number of specs that extend this one.
+    So are splits: their shares are one distribution. `file_of` returns the file of a spec by its path or shipped name;
+    names of other files are relative to `folder`. `depth` counts the specs that extend this one.
 
     Raises:
         InputError: there is no such spec, or too many extend each other.

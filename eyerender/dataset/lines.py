@@ -21,12 +21,7 @@ from ..folders.imagefolder import LINES, METADATA, SHARDS, finished, shard_name
 
 @dataclass(frozen=True, slots=True)
 class ShardLines:
-    """Where the lines of each shard stand in a metadata.jsonl.
-
-    Attributes:
-        path: the file.
-        places: shard -> sample, first byte and length of each line, in the order of the shard's own file.
-    """
+    """Where lines stand in a metadata.jsonl: shard -> sample, first byte and length of each, in the shard's order."""
 
     path: Path
     places: dict[int, list[tuple[int, int, int]]]
@@ -48,11 +43,7 @@ class ShardLines:
         return found
 
     def of(self, shard: int) -> Iterator[bytes]:
-        """Yield the lines of a shard, as its own file holds them.
-
-        Raises:
-            InputError: metadata.jsonl cannot be read.
-        """
+        """Yield the lines of a shard, as its own file holds them; InputError if metadata.jsonl cannot be read."""
         with opened(self.path, limit=MAX_BYTES, follow=False) as file:
             for _, start, length in self.places.get(shard, ()):
                 file.seek(start)

@@ -35,19 +35,12 @@ _SUBJECTS = 64  # whose exposure times are kept
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image of a sample.
+    """An image of a sample."""
 
-    Attributes:
-        name: file name without its suffix.
-        pictures: pixels by kind (`LabelsSpec.pictures`).
-        line: metadata, without the names of files.
-        saturated: whether the image is saturated (`is_saturated`).
-    """
-
-    name: str
-    pictures: dict[str, NDArray[Any]]
-    line: dict[str, Any]
-    saturated: bool
+    name: str  # file name without its suffix
+    pictures: dict[str, NDArray[Any]]  # pixels by kind (`LabelsSpec.pictures`)
+    line: dict[str, Any]  # metadata, without the names of files
+    saturated: bool  # whether the image is saturated (`is_saturated`)
 
 
 @dataclass(frozen=True)

@@ -52,19 +52,13 @@ class GivenScene:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnScenes:
-    """Where the scenes of a plan come from, if not from its spec.
+    """Where the scenes of a plan come from, if not from its spec."""
 
-    Attributes:
-        reference: `module:function`; empty where the scenes are handed over one by one (`DatasetWriter`).
-        sha256: SHA-256 of the module's file; empty where it has none.
-        frames: frames of each scene that is handed over; 0 for a function.
-        function: takes (seed, sample) and what it names of `MORE`, and returns a scene or (scene, draws); None where it
-            is not loaded.
-    """
-
-    reference: str
-    sha256: str = ""
-    frames: int = 0
+    reference: str  # `module:function`; empty where the scenes are handed over one by one (`DatasetWriter`)
+    sha256: str = ""  # SHA-256 of the module's file; empty where it has none
+    frames: int = 0  # frames of each scene that is handed over; 0 for a function
+    # takes (seed, sample) and what it names of `MORE`, and returns a scene or (scene, draws); None where it is not
+    # loaded
     function: Callable[..., Any] | None = field(default=None, compare=False)
 
     @classmethod
@@ -112,11 +106,7 @@ class OwnScenes:
         return self.function is not None and "attempt" in _more(self.function)
 
     def at(self, seed: int, turn: Turn, base: Path) -> GivenScene:
-        """Return the scene of a sample.
-
-        Raises:
-            InputError: the function failed, or gave no scene.
-        """
+        """Return the scene of a sample; InputError if the function failed, or gave no scene."""
         if self.function is None:
             raise InputError("a file does not make this package run a function; name it yourself", source=self.name)
         call = f"{self.name}({seed}, {turn.sample})"
@@ -140,11 +130,7 @@ class OwnScenes:
         return self.reference or "the scene"
 
     def check(self, seed: int, turn: Turn, base: Path) -> None:
-        """Check that the function gives the same scene twice.
-
-        Raises:
-            InputError: it does not.
-        """
+        """Check that the function gives the same scene twice; InputError if it does not."""
         try:
             first, second = self.at(seed, turn, base), self.at(seed, turn, base)
         except InputError:
@@ -214,11 +200,7 @@ def _more(function: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def _reference_of(function: Any) -> str:
-    """Name a function so that a worker process can import it.
-
-    Raises:
-        InputError: it cannot.
-    """
+    """Name a function so that a worker process can import it; InputError if it cannot."""
     module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
     if not module or not name or "<" in name:
         raise InputError("must be a function at the top of a module, so that workers can import it", source="scenes")

@@ -41,10 +41,10 @@ from ..base.storage.jsonlines import MAX_BYTES
 from ..folders.imagefile import Writer
 from ..folders.imagefolder import DONE, KINDS, LINES, SHARDS, STAGE, shard_name
 from .done import FILES, PACKED, cpu_family, described, picture_file, read_done, read_done_file, run_versions, sum_of
+from .environment import rounding
 from .maker import MadeSample
 from .packing import SHARD, pack, unpack
 from .plan import Plan
-from .rounding import rounding
 
 CHECKPOINT_S = 10.0
 """Time between checkpoints: the most work lost when a worker is killed."""

@@ -72,11 +72,7 @@ class Sample:
     base: Path
 
     def build(self) -> Scene:
-        """Build the scene.
-
-        Raises:
-            InputError: the drawn values do not fit together.
-        """
+        """Build the scene; InputError if the drawn values do not fit together."""
         spec = SceneSpec.from_mapping(self.scene, source=f"sample {self.turn.sample}")
         eye = _eye(json.dumps(self.eye, sort_keys=True)) if self.eye else None
         scene = Scene.compiled(spec, eye, base=self.base)

@@ -102,16 +102,10 @@ class Realised:
 def sample(
     spec: str | Path | DatasetSpec | Plan, index: int, *, eye: str | None = None, seed: int | None = None
 ) -> Realised:
-    """Draw sample `index` of a dataset as `generate` does: values, scene and analytic observations.
+    """Draw sample `index`, from 0, of a dataset as `generate` does: values, scene and analytic observations.
 
     >>> er.sample("dataset_quick", 0).scene.spec.image.spp
     4
-
-    Args:
-        spec: as for `generate`.
-        index: index of the sample, counted from 0.
-        eye: as for `generate`.
-        seed: as for `generate`.
 
     Raises:
         InputError: there is no such sample, or it was given up.
@@ -172,11 +166,7 @@ def realise(plan: Plan, index: int, frames: int | None = None) -> Realised:
 
 
 def _observed(plan: Plan, sample: Sample, frames: int | None) -> tuple[Frames, Observations]:
-    """Trace a sample that was drawn.
-
-    Raises:
-        InputError: its scene is not as the dataset requires.
-    """
+    """Trace a sample that was drawn; InputError if its scene is not as the dataset requires."""
     scene = sample.build()
     check_windows(scene)
     posed = scene.frames()
@@ -195,11 +185,7 @@ def _drawn_again(plan: Plan, last: Sample, sample: Sample) -> bool:
 
 
 def frames_of(plan: Plan) -> int:
-    """Return the number of frames of each sample, from sample 0.
-
-    Raises:
-        InputError: sample 0 cannot be made at all.
-    """
+    """Return the number of frames of each sample, from sample 0; InputError if sample 0 cannot be made at all."""
     first = realise(plan, 0)
     if first.scene is None:
         last = first.rejections[-1].reason if first.rejections else "no reason known"
@@ -267,11 +253,7 @@ def sample_line(
             "sequence_index": turn.sequence,
             "timestamp_s": finite_or_none(observations.index.timestamp_s[row]),
         },
-        drawn={
-            "attempt": turn.attempt,
-            "subject_attempt": turn.subject_attempt,
-            "draws": sample.draws,
-        },
+        drawn={"attempt": turn.attempt, "subject_attempt": turn.subject_attempt, "draws": sample.draws},
         tree={**sample.scene, "sensor": {**sample.scene.get("sensor", {}), **exposed}},
         eye=sample.eye or None,
     )

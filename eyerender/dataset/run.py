@@ -20,7 +20,7 @@ from ..folders.outfolder import clear, refuse_non_empty
 from ..rig.plausibility import saturation_warnings
 from .assemble import FAILURES, assemble, damage
 from .done import cpu_family, read_done
-from .environment import environment
+from .environment import by_rounding, environment, rounding
 from .estimate import Speed, keep_rate
 from .lines import restore_lines
 from .options import RunOptions
@@ -28,7 +28,6 @@ from .partial import checkpoints, set_aside
 from .plan import Plan
 from .pool import NO_SHARD, LocalPool
 from .realise import frames_of
-from .rounding import by_rounding, rounding
 from .runfile import begin, refuse_another_count, refuse_taken, settle, was_resized
 from .selection import in_spread_order
 from .shard import Staged, commit, fits, is_finished, remove_leftovers, withdraw_damaged

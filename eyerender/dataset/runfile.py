@@ -19,10 +19,9 @@ from ..folders.packed import INDEX
 from .assemble import CARD, FAILURES
 from .croissant import CROISSANT
 from .done import FILES, PACKED, read_done, run_versions
-from .environment import environment
+from .environment import environment, rounding
 from .lines import restore_lines
 from .plan import Plan
-from .rounding import rounding
 from .spec import DatasetSpec
 
 MAX_SHARDS, MAX_CHOICES = 1_000_000, 100_000_000

@@ -51,12 +51,8 @@ def write_shard(
 ) -> Staged:
     """Make the samples of a shard in a temporary folder, continuing where an earlier worker stopped.
 
-    Args:
-        maker: the maker of the samples.
-        folder: the dataset.
-        shard: number of the shard.
-        on_sample: called with the number of finished samples and the number of images of the last one.
-        stop: called before each sample; if it returns true, samples in progress are finished and no new one is begun.
+    `on_sample` is called with the number of finished samples and of images of the last one. If `stop`, called before
+    each sample, returns true, samples in progress are finished and no new one is begun.
 
     Raises:
         Stopped: `stop` returned true.
@@ -177,11 +173,7 @@ def fits(folder: Path, shard: int, samples: Sequence[int]) -> bool:
 def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool = False) -> Iterator[str]:
     """Describe each damage of a finished shard: its done.json, and the sizes and SHA-256 of its files.
 
-    Args:
-        folder: the dataset.
-        shard: a finished shard.
-        digest: digest of the plan that the shard must have; None: any plan.
-        quick: compare sizes only.
+    The shard must be of the plan of this digest, if given; `quick` compares sizes only.
     """
     name = shard_name(shard)
     try:

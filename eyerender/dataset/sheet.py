@@ -16,7 +16,7 @@ from ..base.progress import Progress, notify
 from ..base.storage.files import written
 from ..folders.imagefile import preview as eight_bit
 from ..imaging.capture import make_renderer, render_windows
-from ..imaging.labels import EyeInWindow, known_labels
+from ..imaging.labels import EyeInWindow, known_labels, lid_landmarks
 from ..optics.ellipse import points_on_ellipse
 from ..rig.plausibility import is_saturated, saturation_warnings
 from ..scene import Frames, Scene, is_dataset, load_scene, refuse_folder, shipped_files
@@ -25,7 +25,6 @@ from .maker import Maker
 from .plan import Plan, is_function
 from .realise import frames_of, realise
 from .spec import DatasetSpec, shipped_datasets
-from .validation.truth import lid_landmarks
 
 TILES = 16
 _COLUMNS, _WIDTH, _GAP = 4, 320, 4

@@ -42,8 +42,7 @@ class LabelsSpec(Spec):
     )
     amodal_masks: bool = Field(default=False, description="also write masks of the eye without anything in front of it")
     as_annotated: bool = Field(
-        default=False,
-        description="also write masks as people draw them: lids cut the eye, lashes and glints do not",
+        default=False, description="also write masks as people draw them: lids cut the eye, lashes and glints do not"
     )
     noiseless: bool = Field(
         default=False, description="also write each image without sensor noise, from the same rendering"
@@ -76,12 +75,7 @@ class LabelsSpec(Spec):
     def pictures(self) -> tuple[str, ...]:
         """Kinds of images that every sample has; each kind has its own folder."""
         more = ("amodal_masks", "as_annotated", "noiseless", "highlights", "lens_reflections")
-        return (
-            "images",
-            "masks",
-            *(kind for kind in more if getattr(self, kind)),
-            *sorted(set(self.geometry or ())),
-        )
+        return ("images", "masks", *(kind for kind in more if getattr(self, kind)), *sorted(set(self.geometry or ())))
 
 
 class DatasetSpec(FileSpec):
@@ -216,11 +210,7 @@ class DatasetSpec(FileSpec):
 
     @classmethod
     def refuse_other_kinds(cls, data: Mapping[str, Any], *, source: str = "") -> None:
-        """Check that a mapping is declared as a dataset.
-
-        Raises:
-            InputError: the mapping is of another kind.
-        """
+        """Check that a mapping is declared as a dataset; InputError if the mapping is of another kind."""
         if data.get("kind") != DATASET_KIND:
             if "rig" in data:
                 raise InputError(NOT_A_DATASET, source=source)

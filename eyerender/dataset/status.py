@@ -115,11 +115,7 @@ class _Part:
 
 
 def status(path: str | Path) -> dict[str, Any]:
-    """Return the state of a dataset's folder (schema eyerender/status/1).
-
-    Raises:
-        InputError: the folder holds no run.
-    """
+    """Return the state of a dataset's folder (schema eyerender/status/1); InputError if the folder holds no run."""
     folder = Path(path)
     run = read_run(folder)
     try:

@@ -118,9 +118,12 @@ class Template:
         _collect(tree, "", draws, problems, prefix)
         _check_references(tree, "", variables, problems, prefix)
         problems.check()
-        for path in draws if not clips else ():
-            if draws[path].draw.per == "clip":
-                raise InputError("needs a sequence in the scene", source=source, path=f"{_join(prefix, path)}.per")
+        refused = (
+            {"sample": "would change within a clip; use clip"} if clips else {"clip": "needs a sequence in the scene"}
+        )
+        for path, placed in draws.items():
+            if (reason := refused.get(str(placed.draw.per))) is not None:
+                raise InputError(reason, source=source, path=f"{_join(prefix, path)}.per")
         if clips:
             draws = {path: _of_clip(placed) for path, placed in draws.items()}
         # Draws are sorted by name, so that the order of keys in a file has no effect.
@@ -188,8 +191,8 @@ class Template:
 
 
 def _of_clip(placed: PlacedDraw) -> PlacedDraw:
-    """Return a draw that is made per clip, unless it states another unit."""
-    return PlacedDraw(placed.draw, "clip") if placed.unit == "sample" and placed.draw.per is None else placed
+    """Return a draw that is made per clip, unless it is made per subject."""
+    return PlacedDraw(placed.draw, "clip") if placed.unit == "sample" else placed
 
 
 def _with_variables(node: Any, variables: Mapping[str, Any]) -> Any:
@@ -301,11 +304,7 @@ def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str,
 
 
 def _refuse_misspelt(node: Mapping[str, Any], source: str, shown: str) -> None:
-    """Raise an error for a mapping that looks like a draw but misspells the key `draw`.
-
-    Raises:
-        InputError: naming the key.
-    """
+    """Raise an error for a mapping that looks like a draw but misspells the key `draw`; InputError naming the key."""
     keys = [key for key in node if isinstance(key, str)]
     if _PARTS.intersection(keys):
         for key in get_close_matches(MARK, [key for key in keys if key not in _PARTS], 1, 0.6):

@@ -19,10 +19,9 @@ from ..base.progress import Progress
 from ..folders.imagefolder import FILE_KEYS, Entries, ImageEntry, ImageFolder
 from .assemble import verify_dataset
 from .validation.images import Tally, check_images
-from .validation.lines import Lines, check_records
+from .validation.lines import Lines, check_records, compare_lines
 from .validation.problems import FolderProblems
 from .validation.rendering import render_again
-from .validation.shards import compare_lines
 from .validation.truth import Again, DatasetTruth, NoTruth, SceneTruth, truth_of
 
 SAMPLE = 64
@@ -136,11 +135,7 @@ def _check(
 
 
 def _find_files(entry: ImageEntry) -> None:
-    """Check that the files named in the metadata exist inside the folder.
-
-    Raises:
-        InputError: naming the first missing file.
-    """
+    """Check that the files named in the metadata exist inside the folder; InputError naming the first missing file."""
     for key in FILE_KEYS:
         entry.check(key)
 

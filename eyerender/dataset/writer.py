@@ -137,11 +137,7 @@ class DatasetWriter:
             self.summary = run.finish()
 
     def __contains__(self, sample: object) -> bool:
-        """Whether a sample is stored, or was given up.
-
-        Raises:
-            InputError: it is no number of a sample of this part.
-        """
+        """Whether a sample is stored, or was given up; InputError if it is no number of a sample of this part."""
         shard = self._shard_of(sample)
         return self._opened_run.has(shard) or sample in self._entered(shard).made
 

@@ -30,9 +30,9 @@ from ..rig.rig import RigGeometry, RigLike
 from ..scene.observation import EYES, Observations
 from .eyefile import changed_file
 from .features import MeasuredFeatures, Residuals, measured, residuals, sized
-from .information import EyeInformation, eye_information
+from .information import EyeInformation, eye_information, roots_of
 from .noise import FeatureNoise
-from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, KAPPA, LOCAL, NAMES, PERSON, PUPIL, UNITS, Unknowns
+from .unknowns import ANGLES, AZIMUTH, COUNT, ELEVATION, KAPPA, LOCAL, NAMES, PERSON, PUPIL, SLIPPAGE, UNITS, Unknowns
 from .varied import (
     Views,
     diameters_mm,
@@ -344,6 +344,8 @@ def fit_one(
         theta, converged = solve(problem, other)
     if options.start is None and (other := restarted(problem, theta)) is not None:
         theta, converged = solve(problem, other)
+    if problem.shared and problem.free[SLIPPAGE].any():
+        theta = theta + marginal_step(problem, theta)
     _refuse_strange(problem, theta)
     found = _result(mine, rows, problem, (theta, converged), (spec, unknowns))
     if options.person is None:
@@ -635,6 +637,35 @@ def solve(problem: Problem, theta: Floats, steps: int = _STEPS) -> tuple[Floats,
         if settled.all():
             break
     return theta, settled
+
+
+def marginal_step(problem: Problem, theta: Floats) -> Floats:
+    """Compute the step (i, 35) from the joint mode of all unknowns to the mode of the person's, frames integrated out.
+
+    Frames have unknowns of their own, so the joint mode is biased however many there are (Neyman and Scott 1948): the
+    slippage of every frame is smaller for a smaller eye, nearer to the camera. By Fisher's identity the gradient of the
+    person's likelihood is the mean of the joint gradient g over a frame's unknowns,
+
+        E[g(x)] = g(x) + 1/2 sum_k (g(x + v_k) + g(x - v_k) - 2 g(x))                                             (4b)
+
+    with the columns v_k of a root of their covariance A^-1. The frames move to their means. Instants that lose a
+    feature at one of these points add nothing.
+    """
+    found = residuals(problem.seen, slopes_of(problem.views, theta[problem.instant], _POINTS, problem.free))
+    weights = weights_of(problem, found)
+    matrix, vector = equations_of(problem, theta, found, weights)
+    local = np.flatnonzero(problem.free[:LOCAL])
+    root = roots_of(matrix[:, local[:, None], local] + np.diag(problem.precision[local]))
+    bend = np.zeros_like(vector)
+    for shift in np.concatenate([root, -root], axis=2).transpose(2, 0, 1):
+        moved = theta.copy()
+        moved[:, local] += shift
+        at = residuals(problem.seen, slopes_of(problem.views, moved[problem.instant], _POINTS, problem.free))
+        bend += (equations_of(problem, moved, at, weights)[1] - vector) / 2.0
+        lost = (at.outline_size != found.outline_size) | (at.glint_ok != found.glint_ok).any(axis=1)
+        bend[problem.instant[lost]] = np.nan
+    step = arrow_step(replace(problem, centre=theta), matrix, np.nan_to_num(bend), theta, np.zeros(len(theta)))
+    return _limited(problem, step)
 
 
 def without_wrong_outlines(problem: Problem, theta: Floats) -> Floats | None:

@@ -321,6 +321,16 @@ def arrow_inverse(matrices: Floats, unknowns: Unknowns) -> Inverse:
     return Inverse(covariance=covariance, unseen=tuple(unseen))
 
 
+def roots_of(matrices: Floats) -> Floats:
+    """Compute roots V (i, q, q) of inverse matrices, V V^T = A^-1; columns of undetermined directions are 0."""
+    scale = _scales(np.einsum("iaa->ia", matrices))
+    values, vectors = np.linalg.eigh(matrices * scale[:, :, None] * scale[:, None])
+    seen = values > UNSEEN
+    return np.asarray(
+        scale[..., None] * vectors * np.where(seen, 1.0 / np.sqrt(np.where(seen, values, 1.0)), 0.0)[:, None]
+    )
+
+
 def _scales(diagonal: Floats) -> Floats:
     """Return 1 / sqrt(diagonal), 1 where it is 0."""
     return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))

@@ -11,12 +11,20 @@ with the read noise r (quantisation included). With constant noise s, a step of 
 
 which for constant noise s and a peak A is pi A^2 / (2 s^2). Saturated pixels carry no information, so a saturated glint
 loses its core.
+
+The extractor takes the outline of a pupil that is no ellipse from ridges of the gradient (Canny 1986), with a filter of
+width f. The second derivative of filtered noise over the curvature of the ridge is the error of an edge point, and
+points within 2 sqrt(pi) f share it, so the variance of one px of outline is
+
+    sigma^2 = (3 sqrt(pi) / 4) (s / d)^2 (b^2 + f^2)^3 / f^5                                                      (2b)
+
+with the noise s of a pixel half-way up the edge. For constant noise and the best f, 2.2 b, this is 1.4 times the bound.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,8 +47,10 @@ PUPIL_SHARE = 0.1
 CORNEAL_RADIUS_MM, CORNEAL_INDEX = 7.8, 1.376
 PUPIL_DEPTH_MM, ROTATION_MM = 3.5, 10.0
 """Depth of the pupil behind the corneal apex, and its distance from the centre of rotation (both rounded)."""
+BESIDE_PUPIL = 0.8
+"""Light of the iris beside the pupil over that of a mean iris that is lit alike (four rendered ones: 0.74 to 0.82)."""
 _SAMPLES, _REACH = 400, 6.0
-_EXTRACTED_OUTLINE, _EXTRACTED_GLINT = (1.25, 0.035), (1.6, 0.0)
+_EXTRACTED_GLINT = 1.1
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -84,8 +94,8 @@ def sensor_noise(
     """Compute the feature noise of a scene from its lamps, sensor and iris albedo, without rendering.
 
     The levels of a camera are those of the first eye that it sees, at its reference position, looking straight ahead.
-    Its blur is the sensor's, a pixel's area, the circle of confusion at the pupil and half of the path of the pupil
-    during the exposure (across and along it), each by its variance.
+    Its blur is the sensor's, a pixel's area, the circle of confusion at the pupil and the pupil's path during the
+    exposure, each by its variance. The variance of an outline is the mean of those along and across the path.
 
     >>> (er.sensor_noise(er.load_scene("headset")).outline_px < 1).tolist()
     [True]
@@ -95,9 +105,23 @@ def sensor_noise(
         fixation_deg: noise of fixation.
         lights: replaces the scene's lamps.
     """
+    return _noise_of(scene, False, fixation_deg, scene.rig.lights if lights is None else lights)
+
+
+def extracted_noise(scene: Scene, *, fixation_deg: float = FIXATION_DEG) -> FeatureNoise:
+    """Compute the noise of the features that `extract` finds, for pupils that are no ellipses; equation (2b).
+
+    Lamps light the iris obliquely, and it is darker beside the pupil. Glints lie on the iris; the factor 1.1 of their
+    noise was fitted to rendered frames. `scripts/bench_noise.py` compares both with frames of other people and rigs.
+    """
+    return _noise_of(scene, True, fixation_deg, scene.rig.lights)
+
+
+def _noise_of(scene: Scene, extracted: bool, fixation_deg: float, lights: Sequence[Lamp]) -> FeatureNoise:
+    """Compute the noise of features from the sensor alone, or as they are extracted."""
     rig, sensor = scene.rig, scene.spec.sensor
-    lights = rig.lights if lights is None else lights
     read = read_noise_e(sensor)
+    edge_noise = ridge_deviation if extracted else edge_deviation
     outline, glint = np.empty(len(rig.cameras)), np.full((len(rig.cameras), len(lights)), np.inf)
     for k, camera in enumerate(rig.cameras):
         side = next(filter(camera.sees, scene.spec.subject.eyes), scene.spec.subject.eyes[0])
@@ -106,47 +130,51 @@ def sensor_noise(
         surface, point = camera.light_shares(eye_mm)
         radiance = surface * iris_radiance(lit.values(), eye_mm, scene.spec.look.iris_albedo)
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
+        if extracted:
+            iris *= BESIDE_PUPIL * oblique_share(list(lit.values()), eye_mm)
         dark = PUPIL_SHARE * iris
-        blur = blur_px(scene, camera, eye_mm)
-        edge = edge_information(dark, iris, blur, read, sensor.full_well_e)
-        outline[k] = 1.0 / np.sqrt(edge) if edge > 0 else np.inf
+        behind = iris if extracted else dark
+        blurs = blurs_px(scene, camera, eye_mm)
+        blur = float(np.sqrt(np.mean(blurs**2)))
+        outline[k] = np.sqrt(
+            np.mean([edge_noise(dark, iris, b, read, sensor.full_well_e) ** 2 for b in blurs.tolist()])
+        )
         for j, lamp in lit.items():
             energy, size = glint_energy(lamp, camera, eye_mm, sensor, scene.spec.wavelength_nm)
             spread = float(np.hypot(blur, size))
-            glint[k, j] = glint_deviation(point * energy, spread, dark, read, sensor.full_well_e)
+            glint[k, j] = glint_deviation(point * energy, spread, behind, read, sensor.full_well_e)
+    if extracted:
+        glint = _EXTRACTED_GLINT * glint
     return FeatureNoise(outline_px=frozen(outline), glint_px=frozen(glint), fixation_deg=fixation_deg)
 
 
-def extracted_noise(noise: FeatureNoise) -> FeatureNoise:
-    """Compute the noise of the features that `extract` finds, from that of the sensor.
-
-    The extractor's own edges and fits add to it: outline_px becomes sqrt((a outline_px)^2 + b^2), and so do glints. The
-    constants were chosen with rendered frames (`scripts/bench_noise.py`).
-    """
-    outline, glint = (
-        np.hypot(a * known, b)
-        for known, (a, b) in ((noise.outline_px, _EXTRACTED_OUTLINE), (noise.glint_px, _EXTRACTED_GLINT))
-    )
-    return replace(noise, outline_px=frozen(outline), glint_px=frozen(glint))
+def oblique_share(lamps: Sequence[Lamp], eye_mm: Floats) -> float:
+    """Compute the light on the iris of an eye that looks straight ahead, over that of one that faces every lamp."""
+    light = np.array([lamp.towards(eye_mm)[::2] for lamp in lamps]).reshape(-1, 2)
+    ways = np.array([lamp.position_mm for lamp in lamps]).reshape(-1, 3) - eye_mm + [PUPIL_DEPTH_MM, 0.0, 0.0]
+    far = np.linalg.norm(ways, axis=1)
+    facing = float(np.sum(light[:, 0] * np.maximum(ways[:, 0], 0.0) / far**3))
+    return facing / max(float(np.sum(light[:, 0] / light[:, 1] ** 2)), 1e-300)
 
 
-def blur_px(scene: Scene, camera: PinholeCamera, eye_mm: Floats) -> float:
-    """Compute the standard deviation (px) per axis of the blur of an eye's pupil: sensor, pixel, defocus and motion.
+def blurs_px(scene: Scene, camera: PinholeCamera, eye_mm: Floats) -> Floats:
+    """Compute the standard deviations (2,) px of the blur of an eye's pupil, along its path and across it.
 
-    A disc of diameter c has the variance c^2 / 16 along each axis, a path of length l has l^2 / 12 along it.
+    The blur is that of sensor, pixel, defocus and motion. A disc of diameter c has the variance c^2 / 16 along each
+    axis, a path of length l has l^2 / 12 along it.
     """
     sensor, motion = scene.spec.sensor, scene.spec.motion
     pupil = eye_mm + np.array([-PUPIL_DEPTH_MM, 0.0, 0.0])
     depth = float(camera.depth(pupil))
     disc = 0.0 if scene.spec.lens.focus_mm is None else float(confusion_px(scene.spec.lens, camera, sensor, depth))
-    variance = sensor.psf_sigma_px**2 + 1.0 / 12.0 + disc**2 / 16.0
+    variance = np.full(2, sensor.psf_sigma_px**2 + 1.0 / 12.0 + disc**2 / 16.0)
     if motion is not None:
         turn = np.radians(np.array([motion.eye_deg_s[0], motion.eye_deg_s[1]])) * ROTATION_MM
         speed = np.array(motion.head_mm_s) + np.array([0.0, turn[0], turn[1]])
         path = speed * sensor.time_ms * 1e-3
         ends, _ = camera.project(np.stack([pupil - path / 2.0, pupil + path / 2.0]))
-        variance += float(np.sum((ends[1] - ends[0]) ** 2)) / 24.0
-    return float(np.sqrt(variance))
+        variance[0] += float(np.sum((ends[1] - ends[0]) ** 2)) / 12.0
+    return np.asarray(np.sqrt(variance))
 
 
 def read_noise_e(sensor: Sensor) -> float:
@@ -172,6 +200,27 @@ def edge_information(low_e: float, high_e: float, blur_px: float, read_e: float,
     slope = (high_e - low_e) * density / blur_px
     use = level < well_e
     return float(np.sum(np.where(use, slope**2 / (level + read_e**2), 0.0)) * step * blur_px)
+
+
+def edge_deviation(low_e: float, high_e: float, blur_px: float, read_e: float, well_e: float = np.inf) -> float:
+    """Compute the least standard deviation (px) of one px of an edge, equation (1); arguments of `edge_information`."""
+    information = edge_information(low_e, high_e, blur_px, read_e, well_e)
+    return float(1.0 / np.sqrt(information)) if information > 0 else np.inf
+
+
+def ridge_deviation(low_e: float, high_e: float, blur_px: float, read_e: float, well_e: float = np.inf) -> float:
+    """Compute the standard deviation (px) of one px of an edge from the gradient's ridge, equation (2b).
+
+    The extractor's filter is 1 px wide for a clear edge, up to 2.5 px for a noisy one, and as wide as a blur of more
+    than 1.7 times that. The arguments are those of `edge_information`.
+    """
+    low, high = min(low_e, well_e), min(high_e, well_e)
+    if high <= low:
+        return np.inf
+    ratio = float(np.sqrt((low + high) / 2.0 + read_e**2)) / (high - low)
+    width = min(max(9.0 * ratio, 1.0), 2.5)
+    width = blur_px if blur_px > 1.7 * width else width
+    return float(np.sqrt(0.75 * np.sqrt(np.pi) * (blur_px**2 + width**2) ** 3 / width**5)) * ratio
 
 
 def glint_deviation(energy_e: float, spread_px: float, background_e: float, read_e: float, well_e: float) -> float:

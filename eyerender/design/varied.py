@@ -21,7 +21,7 @@ from ..eye.batch import slices, stack_eyes, structure_of, take_eyes
 from ..eye.model import EyeModel, RotationCentres, Stop
 from ..eye.pose import Poses, rigid_motion
 from ..optics.surfaces import Surface
-from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_graph import Biconic
 from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import direction_of, normalize
 from ..rig.rig import RigGeometry

@@ -21,18 +21,11 @@ def contour_pupil(
 ) -> RotatedRect | str:
     """Detect the pupil as OpenCV's rotated rectangle (centre, full axes, degrees), or return the reason for failure.
 
-    The image is smoothed with a 5 x 5 Gaussian after glints are closed by a morphological opening. It is cut at
-    `LEVELS` thresholds below Otsu's. Dark regions of a likely size are kept if they do not touch the frame and fill at
-    least `FILLED` of their hull; `cv2.fitEllipse` is applied to the hull. The region with the steepest outline relative
-    to its level is the pupil, because lids and shadows are softer. The contour runs through the centres of the
-    outermost dark pixels, so half a pixel is added to the semi-axes.
-
-    Source of the first threshold: Otsu (1979).
-
-    Args:
-        image: (h, w) image.
-        bit_depth: bits of the image.
-        radius_px: (2,) smallest and largest accepted semi-axis.
+    The image (h, w) is smoothed with a 5 x 5 Gaussian after glints are closed by a morphological opening. It is cut at
+    `LEVELS` thresholds below Otsu's (1979). Dark regions are kept if their semi-axes lie within `radius_px` (2,), do
+    not touch the frame and fill at least `FILLED` of their hull; `cv2.fitEllipse` is applied to the hull. The region
+    with the steepest outline relative to its level is the pupil, because lids and shadows are softer. The contour runs
+    through the centres of the outermost dark pixels, so half a pixel is added to the semi-axes.
     """
     full = float(2**bit_depth - 1) if image.dtype.kind in "ui" else float(image.max())
     if full <= 0.0:

@@ -22,11 +22,7 @@ def compile_all() -> None:
 
 
 def drawn_eye(*, lid: bool = False) -> Bytes:
-    """Draw a pupil (320 x 240) with two touching glints on its boundary, and one clipped glint beside it.
-
-    Args:
-        lid: whether a lid covers a third of the pupil.
-    """
+    """Draw a pupil (320 x 240), with a `lid` over a third, two touching glints on its rim and one clipped beside it."""
     x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
     radius = np.hypot((x - 160.0) / 36.0, (y - 120.0) / 33.0)
     level = 90.0 - 60.0 / (1.0 + np.exp(30.0 * (radius - 1.0)))

@@ -18,17 +18,9 @@ _SURE, _UNSURE, _GLINT, _REJECTED = (80, 220, 60), (40, 170, 255), (255, 190, 40
 
 
 def overlay(image: NDArray[Any], found: Sequence[Extraction], full_scale: float) -> Bytes:
-    """Draw results over an image.
+    """Draw results over an image (h, w), white at `full_scale`; return (h, w, 3) blue, green, red, as OpenCV takes it.
 
     The outline is green, or orange below a confidence of 0.9. Glints are blue crosses, rejected reflections grey ones.
-
-    Args:
-        image: (h, w) levels.
-        found: the extraction to draw.
-        full_scale: level that is drawn white.
-
-    Returns:
-        (h, w, 3) blue, green, red, as OpenCV takes it.
     """
     grey = np.clip(np.asarray(image, dtype=np.float32) * (255.0 / full_scale), 0.0, 255.0).astype(np.uint8)
     out = np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))

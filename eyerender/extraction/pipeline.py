@@ -14,8 +14,7 @@ from ..base.jit import ensure_compiled
 from .glints.classification import EyeContext, classify_spots
 from .glints.deblending import split_blends
 from .glints.detection import Spots, detect_spots, search_reach, widest
-from .glints.fits import SpotFit
-from .glints.fitting import Limits, fit_spots
+from .glints.fitting import Limits, SpotFit, fit_spots
 from .glints.patches import measure_patches
 from .glints.subtraction import affected_pixels, part_about, subtract_spots, well_fitted
 from .preprocessing import DN, ImagePart, Prepared, prepare

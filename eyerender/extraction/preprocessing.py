@@ -31,23 +31,14 @@ def as_image(array: NDArray[np.generic]) -> Image:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Prepared:
-    """An image prepared for extraction.
+    """An image prepared for extraction."""
 
-    Attributes:
-        linear: (h, w) float32 linear intensity, full scale 255.
-        clip_dn: level at which the sensor saturates; infinite for float images.
-        noise_dn: standard deviation of a pixel's noise.
-        least_dn: smallest step that is more than rounding and compression.
-        inverted: whether the image is a negative.
-        scale: pixels of the whole image per pixel.
-    """
-
-    linear: Image
-    clip_dn: float
-    noise_dn: float
-    least_dn: float = 0.0
-    inverted: bool = False
-    scale: float = 1.0
+    linear: Image  # (h, w) float32 linear intensity, full scale 255
+    clip_dn: float  # level at which the sensor saturates; infinite for float images
+    noise_dn: float  # standard deviation of a pixel's noise
+    least_dn: float = 0.0  # smallest step that is more than rounding and compression
+    inverted: bool = False  # whether the image is a negative
+    scale: float = 1.0  # pixels of the whole image per pixel
 
     def rescaled(self, scale: float) -> Prepared:
         """Return the image reduced by the factor `scale` (below 1: enlarged), with its noise at that size."""
@@ -69,12 +60,7 @@ class Prepared:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePart:
-    """A part of an image.
-
-    Attributes:
-        linear: (h, w) its levels, DN.
-        corner: column and row of its first pixel.
-    """
+    """A part of an image: its levels (h, w), DN, and column and row of its first pixel."""
 
     linear: Image
     corner: tuple[int, int]
@@ -83,14 +69,8 @@ class ImagePart:
 def prepare(image: object, bit_depth: int | None, gamma: float) -> Prepared | str:
     """Prepare an image, or return the reason why nothing can be found in it.
 
-    Args:
-        image: (h, w) integers (full scale 2^bit_depth - 1; without bit_depth, that of the type) or floats (any linear
-            scale).
-        bit_depth: bits of an integer image.
-        gamma: the image stores intensity^(1 / gamma).
-
     Raises:
-        InputError: the array is not a single-channel image.
+        InputError: the array is not a single-channel image (see `extract`).
     """
     array = _checked(image)
     if not (np.isfinite(gamma) and 0.1 <= gamma <= 10.0):

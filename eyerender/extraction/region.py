@@ -17,11 +17,7 @@ SearchRegion = tuple[int, int, int, int] | NDArray[Any]
 
 
 def cut_region(image: NDArray[Any], region: SearchRegion) -> tuple[NDArray[Any], tuple[int, int], Bools]:
-    """Cut a region out of an image; pixels outside a mask get the level of the nearest one inside.
-
-    Args:
-        image: (h, w) or (h, w, channels).
-        region: the region.
+    """Cut a region out of an image (h, w, ...); pixels outside a mask get the level of the nearest one inside.
 
     Returns:
         The part, its first column and row, and which of its pixels (h, w) belong to the region.

@@ -68,14 +68,7 @@ class ExtractionSettings(Spec):
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Accepted sizes and shapes of a pupil.
-
-    Attributes:
-        least_px: smallest semi-axis b.
-        most_px: largest semi-axis a.
-        aspect: smallest b / a.
-        support: smallest visible share of the boundary.
-    """
+    """Accepted sizes and shapes of a pupil: semi-axes from b >= `least_px` to a <= `most_px`, b / a, visible share."""
 
     least_px: float
     most_px: float

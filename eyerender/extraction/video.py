@@ -30,23 +30,16 @@ CODECS = {".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
 
 
 def follow(
-    frames: Iterator[VideoFrame] | VideoReader,
+    frames: Iterator[VideoFrame] | VideoReader,  # frames in temporal order
     *,
-    gamma: float = 1.0,
-    settings: ExtractionSettings | None = None,
-    eyes: int = 1,
-    rois: Sequence[SearchRegion] = (),
+    gamma: float = 1.0,  # encoding gamma of the levels
+    settings: ExtractionSettings | None = None,  # settings of the extractor
+    eyes: int = 1,  # 1, or 2 for frames with both eyes: the right one, then the left one
+    rois: Sequence[SearchRegion] = (),  # the part of the frames that is searched for each eye; empty: all
 ) -> Iterator[tuple[VideoFrame, tuple[Extraction, ...]]]:
     """Extract the features of each frame; the search starts where the pupil was last.
 
     A pupil found elsewhere (`Track`) is missing until it has been there as long as the followed one.
-
-    Args:
-        frames: frames in temporal order.
-        gamma: encoding gamma of the levels.
-        settings: settings of the extractor.
-        eyes: 1, or 2 for frames with both eyes: the right one, then the left one.
-        rois: the part of the frames that is searched for each eye; empty: all.
     """
     tracks = [Track() for _ in range(eyes)]
     for frame in frames:
@@ -67,18 +60,12 @@ class Track:
 
     In a blink or a wink something else may look like the pupil: a screw, a brow, the other eye. It is followed only
     after it has been there for as long as the pupil before, or for LONGEST_S.
-
-    Attributes:
-        pupil: the followed pupil where it was last; None before the first.
-        span_s: first and last time at which it was seen.
-        other: the pupil elsewhere.
-        other_s: first time at which it was seen.
     """
 
-    pupil: PupilResult | None = None
-    span_s: tuple[float, float] = (0.0, 0.0)
-    other: PupilResult | None = None
-    other_s: float = 0.0
+    pupil: PupilResult | None = None  # the followed pupil where it was last; None before the first
+    span_s: tuple[float, float] = (0.0, 0.0)  # first and last time at which it was seen
+    other: PupilResult | None = None  # the pupil elsewhere
+    other_s: float = 0.0  # first time at which it was seen
 
     def follow(self, found: Extraction, time_s: float) -> Extraction:
         """Take the result of the next frame, and return it, without the pupil and glints if they are elsewhere."""

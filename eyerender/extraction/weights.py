@@ -35,21 +35,13 @@ def _checked(values: Any, shape: tuple[int, ...]) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ConfidenceTable:
-    """Weights of the confidence and of the covariance's factor; f features.
+    """Weights of the confidence and of the covariance's factor; f features."""
 
-    Attributes:
-        names: the features.
-        limits: (2, f) least and most of each; values beyond are clipped.
-        logit: (1 + 3 f,) weights of the columns of `design`.
-        calibration: (3,) see `calibrated`.
-        scale: (1 + 3 f,) weights of the logarithm of the covariance's factor.
-    """
-
-    names: tuple[str, ...]
-    limits: Floats
-    logit: Floats
-    calibration: Floats
-    scale: Floats
+    names: tuple[str, ...]  # the features
+    limits: Floats  # (2, f) least and most of each; values beyond are clipped
+    logit: Floats  # (1 + 3 f,) weights of the columns of `design`
+    calibration: Floats  # (3,) see `calibrated`
+    scale: Floats  # (1 + 3 f,) weights of the logarithm of the covariance's factor
 
     @staticmethod
     def of(table: Any) -> ConfidenceTable:

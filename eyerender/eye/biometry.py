@@ -77,11 +77,7 @@ class BiometrySpec(Spec):
 
 
 def with_biometry(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace `biometry` in the keys of an eye file by what follows from it; the file's other keys stay.
-
-    Raises:
-        InputError: a number does not fit, or stands beside a key that follows from it.
-    """
+    """Replace `biometry` in the keys of an eye file by what follows from it; InputError if a number does not fit it."""
     for key in MEASURED:
         if key in data:
             raise InputError("cannot stand beside 'biometry', from which it follows", path=key)
@@ -98,13 +94,9 @@ def _adult() -> dict[str, Any]:
 
 
 def iris_root_mm(radius_mm: float, conic_constant: float, depth_mm: float, limbus_mm: float) -> float:
-    """Compute the radius of the iris' root, just inside the limbus and the back of the cornea (a conic).
+    """Compute the radius of the iris' root, just inside the limbus and the back of the cornea.
 
-    Args:
-        radius_mm: apex radius of the back of the cornea.
-        conic_constant: its conic constant.
-        depth_mm: depth of the stop behind its apex.
-        limbus_mm: radius of the limbus.
+    The back is a conic of apex radius `radius_mm`; the stop lies `depth_mm` behind its apex.
     """
     depth = max(depth_mm, 0.0)
     reach = np.sqrt(max(2.0 * radius_mm * depth - (1.0 + conic_constant) * depth**2, 0.0))

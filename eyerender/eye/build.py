@@ -24,13 +24,7 @@ from .surfaces import gradient_lens, index_at, sclera_of, stop_of, surface_of
 
 
 def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_mm: float | None) -> EyeModel:
-    """Build the numeric eye.
-
-    Args:
-        spec: the eye file.
-        side: right or left.
-        wavelength_nm: wavelength in vacuum.
-        pupil_diameter_mm: diameter of the anatomical pupil; None: that of the file.
+    """Build the numeric eye of an eye file, at a wavelength in vacuum; pupil diameter None: that of the file.
 
     Raises:
         InputError: the pupil does not fit, or an index is below 1 at this wavelength.
@@ -46,11 +40,7 @@ def build_eye(spec: EyeParts, side: Side, wavelength_nm: float, pupil_diameter_m
 
 
 def fitting_stop(spec: EyeParts, pupil_diameter_mm: float | None) -> Stop:
-    """Return the stop of the right eye at a diameter (that of the file if None), checked to fit the eye.
-
-    Raises:
-        InputError: the pupil does not fit.
-    """
+    """Return the stop of the right eye at a diameter (None: the file's); InputError if it does not fit."""
     diameter = spec.stop.diameter_mm if pupil_diameter_mm is None else float(pupil_diameter_mm)
     widest = 2.0 * min(spec.limbus_radius_mm, spec.iris.root_radius_mm)
     path = "stop.diameter_mm" if pupil_diameter_mm is None else "pupil_diameter_mm"

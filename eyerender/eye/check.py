@@ -38,11 +38,7 @@ _MISFIT_MM = 0.5
 
 
 def check_eye(spec: EyeParts, *, source: str = "") -> None:
-    """Check the geometry of an eye file.
-
-    Raises:
-        InputError: with the path of the first wrong key.
-    """
+    """Raise InputError with the path of the first wrong key if the geometry of an eye file is impossible."""
 
     def refuse(path: str, reason: str) -> NoReturn:
         raise InputError(reason, source=source, path=path)

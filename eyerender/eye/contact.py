@@ -20,7 +20,7 @@ from ..base.arrays import Floats, frozen
 from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Spec, Vec2
 from ..optics.surfaces import Surface
-from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_graph import Biconic
 from ..optics.surfaces_measured import Measured, ZernikeSurface
 from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import rotation_y, rotation_z
@@ -104,11 +104,7 @@ class ContactLens(Spec):
 
 
 def _bent(surface: Surface, bend: float, origin_mm: Floats, rotation: Floats) -> Surface:
-    """Return a surface with its curvatures raised by `bend` (1/mm), at another place.
-
-    Raises:
-        InputError: the surface has no radii.
-    """
+    """Return a surface with its curvatures raised by `bend` (1/mm), at another place; InputError if it has no radii."""
     if isinstance(surface, Biconic):
         return replace(surface, radii_mm=_raised(surface.radii_mm, bend), origin_mm=origin_mm, rotation=rotation)
     if isinstance(surface, Quadric) and (shape := surface.as_conic()) is not None:

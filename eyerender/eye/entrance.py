@@ -29,10 +29,7 @@ _SETTLED_MM = 1e-10
 def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS, distance_mm: float = FAR_MM) -> float:
     """Compute the diameter (mm) of the entrance pupil of a single eye: that of the circle of equal area.
 
-    Args:
-        eye: the eye.
-        points: number of points of the margin.
-        distance_mm: distance of the observer.
+    `points` of the margin are seen from the distance `distance_mm`.
 
     Raises:
         InputError: a ray from the margin does not leave the eye.
@@ -69,12 +66,8 @@ def stop_for_entrance(
 ) -> float:
     """Compute the diameter (mm) of the stop whose entrance pupil has the diameter `entrance_mm`.
 
-    Args:
-        front: refracting surfaces before the stop, outside in.
-        indices: index behind each.
-        stop_of: returns the stop of a diameter; its position and shape may depend on it.
-        entrance_mm: wanted diameter of the entrance pupil.
-        points: number of points of the margin.
+    `front` are the refracting surfaces before the stop, outside in, with the index behind each. `stop_of` returns the
+    stop of a diameter, on which its position and shape may depend.
 
     Raises:
         InputError: the search does not converge, or a ray does not leave the eye.

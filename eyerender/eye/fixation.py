@@ -54,22 +54,14 @@ _STEPS = 20
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixations(ArrayValue):
-    """A batch of fixations, leading axis n.
+    """A batch of fixations, leading axis n."""
 
-    Attributes:
-        poses: poses of the eye.
-        residual_mm: (n,) miss distance of the line of sight (chief ray: from the target; entrance window: from the
-            fovea).
-        status: (n,) of `Status`.
-        line_of_sight_mm: (n, 3) point where the line of sight meets the cornea, in the eye-fixed frame.
-        line_of_sight_direction: (n, 3) unit vectors from there to the target, in the eye-fixed frame.
-    """
-
-    poses: Poses
+    poses: Poses  # poses of the eye
+    # (n,) miss distance of the line of sight (chief ray: from the target; entrance window: from the fovea)
     residual_mm: Floats
-    status: Statuses
-    line_of_sight_mm: Floats
-    line_of_sight_direction: Floats
+    status: Statuses  # (n,) of `Status`
+    line_of_sight_mm: Floats  # (n, 3) point where the line of sight meets the cornea, in the eye-fixed frame
+    line_of_sight_direction: Floats  # (n, 3) unit vectors from there to the target, in the eye-fixed frame
 
     def reason(self, item: int) -> str | None:
         """Return the reason why fixation `item` failed; None if it did not."""
@@ -138,17 +130,11 @@ def fixate(eye: EyeModel, target_mm: npt.ArrayLike, line_of_sight: LineOfSightKi
 def with_torsion(
     eyes: Sequence[EyeModel], eye_index: npt.ArrayLike, found: Fixations, target_mm: npt.ArrayLike, extra_rad: Floats
 ) -> Poses:
-    """Turn fixating eyes by a torsion in addition to that of Listing's law, so that they still see their targets.
+    """Turn fixating eyes by a torsion (n,) in addition to that of Listing's law, so that they still see their targets.
 
-    A turn about the optic axis alone would move the line of sight off the target, by angle kappa times the torsion.
-    The line of sight keeps its direction to the point where it ended; each step turns the eye by the angle it is off.
-
-    Args:
-        eyes: as for `fixations`.
-        eye_index: (n,) as for `fixations`.
-        found: the fixations without it.
-        target_mm: (n, 3) in the eyes' frames.
-        extra_rad: (n,) torsion to add.
+    A turn about the optic axis alone would move the line of sight off the target, by angle kappa times the torsion. The
+    line of sight keeps its direction to the point where it ended; each step turns the eye by the angle it is off.
+    Targets (n, 3) are in the eyes' frames.
     """
     which, target = np.asarray(eye_index, dtype=np.intp), np.asarray(target_mm, dtype=np.float64)
     azimuth, elevation = np.array(found.poses.azimuth_rad), np.array(found.poses.elevation_rad)
@@ -321,15 +307,11 @@ def _window_miss(eye: EyeModel, target_mm: Floats, angles: Floats) -> _Missed:
 
 
 def entrance_window_centre(eye: EyeModel, viewpoint_mm: Floats) -> tuple[Floats, Bools]:
-    """Compute the centre of the entrance window seen from viewpoints, and where it does not exist.
+    """Compute the centre of the entrance window seen from viewpoints (n, 3), and where it does not exist.
 
     c = mean(p_i) - t mean(u_i) with exit points p_i and directions u_i, where t makes c come closest to the optic axis.
     Where the mean ray runs along the optic axis, t is not determined. The window is then that of a viewpoint 1e-4 rad
     off the axis on the same side; t changes with the square of that angle, by some 1e-9 mm.
-
-    Args:
-        eye: the eye.
-        viewpoint_mm: (n, 3) in the eye frame.
     """
     point, way, lost = _mean_ray(eye, viewpoint_mm)
     length = _to_the_axis(point, way)

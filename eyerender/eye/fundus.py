@@ -44,14 +44,11 @@ _REACH = 12.0  # halo widths, beyond which a lamp returns less than a hundred-th
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FundusLight(ArrayValue):
-    """Radiance factors over the stop, for each lamp.
+    """Radiance factors over the stop, for each lamp."""
 
-    Attributes:
-        factors: (m, CELLS, CELLS) radiance in air towards the camera per irradiance of the stop (1/sr), before the
-            transmittance of the cornea on the way out. Row and column are the coordinates along the second and the
-            first semi-axis of the stop, from -EDGE to EDGE in units of these, at the centres of the cells.
-    """
-
+    # (m, CELLS, CELLS) radiance in air towards the camera per irradiance of the stop (1/sr), before the transmittance
+    # of the cornea on the way out. Row and column are the coordinates along the second and the first semi-axis of the
+    # stop, from -EDGE to EDGE in units of these, at the centres of the cells.
     factors: Floats
 
     def at(self, lamp: int, first: Floats, second: Floats) -> Floats:
@@ -67,21 +64,13 @@ class FundusLight(ArrayValue):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """Reflectance and scatter of the fundus.
+    """Reflectance and scatter of the fundus."""
 
-    Attributes:
-        reflectance: share of the light that returns, away from fovea and optic disc.
-        halo_share: share of that light in the halo.
-        halo_rad: distance at which the halo has fallen by e, in object space.
-        blur_rad: standard deviation of the core, in object space.
-        disc_gain: reflectance of the optic disc over that of the fundus beside it.
-    """
-
-    reflectance: float
-    halo_share: float
-    halo_rad: float
-    blur_rad: float
-    disc_gain: float
+    reflectance: float  # share of the light that returns, away from fovea and optic disc
+    halo_share: float  # share of that light in the halo
+    halo_rad: float  # distance at which the halo has fallen by e, in object space
+    blur_rad: float  # standard deviation of the core, in object space
+    disc_gain: float  # reflectance of the optic disc over that of the fundus beside it
 
 
 def fundus_light(eye: EyeModel, lamps_mm: Floats, camera_mm: Floats, focus_dpt: float, spread: Spread) -> FundusLight:

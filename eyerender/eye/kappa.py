@@ -29,11 +29,7 @@ _FAR_MM, _NO_INDEX = 1e9, 1e-14
 
 
 def pupillary_axis(eye: EyeModel) -> tuple[Floats, Floats]:
-    """Return the point (3,) where the pupillary axis leaves the cornea, and its outward unit direction (3,).
-
-    Raises:
-        InputError: the cornea has no such axis.
-    """
+    """Return where the pupillary axis leaves the cornea (3,), and its outward direction; InputError without one."""
     # Whatever its direction in a medium of index 0, light enters along the normal.
     found = _through_stop(eye, np.array([_FAR_MM, 0.0, 0.0]), _NO_INDEX, "the cornea has no pupillary axis")
     return found.exit_points_mm, np.asarray(eye.front[0].normal(found.exit_points_mm))
@@ -54,11 +50,9 @@ def kappa_deg(eye: EyeModel) -> tuple[float, float]:
 
 
 def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
-    """Compute the fovea (3,) mm that gives an eye an angle kappa: the retinal point on that line of sight.
+    """Compute the fovea (3,) mm that gives an eye an angle kappa (horizontal, vertical), nasal and up.
 
-    Args:
-        eye: the eye; its own fovea is ignored.
-        wanted_deg: kappa (horizontal, vertical), nasal and up.
+    It is the retinal point on that line of sight; the eye's own fovea is ignored.
 
     Raises:
         InputError: the eye has no such line of sight.
@@ -102,10 +96,7 @@ def with_kappa(spec: EyeSpec, wanted_deg: tuple[float, float], *, wavelength_nm:
 def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: float = 1500.0) -> tuple[float, float]:
     """Compute angles (horizontal, vertical) from the optic axis to the nodal ray of the fovea, nasal and up, degrees.
 
-    Args:
-        eye: the eye.
-        fovea_mm: (3,) position of the fovea; default: that of the eye.
-        distance_mm: distance of the nodal ray's object from the corneal apex.
+    The fovea (3,) is that of the eye if None; the object of the nodal ray lies `distance_mm` from the corneal apex.
 
     Raises:
         InputError: no nodal ray ends there.
@@ -128,11 +119,7 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
 
 
 def _through_stop(eye: EyeModel, viewpoint_mm: Floats, n_outside: float, reason: str) -> ApparentPoints:
-    """Find the ray from the centre of the stop to a viewpoint (3,) in a medium of index `n_outside`.
-
-    Raises:
-        InputError: there is no such ray.
-    """
+    """Find the ray from the stop's centre to a viewpoint (3,) in a medium of index `n_outside`, or raise InputError."""
     centre = eye.stop.centre_mm
     found = apparent_points(eye.front, eye.front_indices, centre, viewpoint_mm, n_outside=n_outside)
     if found.status != Status.OK:

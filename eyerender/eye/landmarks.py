@@ -1,4 +1,9 @@
-"""Landmarks of the eye, found by ray tracing: incident node, fovea, and chief ray to the fovea."""
+"""Landmarks of the eye, found by ray tracing: incident node, fovea, and chief ray to the fovea.
+
+A ray that meets the cornea at the small height h with the small slope u reaches the retina at A h + B u + c. Light of
+the vergence K (a power matrix, 1/mm) has u = -K h, so it comes to a focus where A = B K. Spectacles of power F at the
+distance d leave K = F / (1 - d F), hence F = K (1 + d K)^-1.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from ..optics.nodal import crossed, parallel_rays
 from ..optics.shooting import connect
 from ..optics.surfaces import components, join
 from ..optics.trace import Crossing, outward_path, trace
-from ..optics.transforms import flip_y, normalize
+from ..optics.transforms import flip_y, inverse_2x2, normalize
 from .model import EyeModel, LineOfSight
 
 NODE_RING_DEG = 14.3
@@ -41,12 +46,9 @@ def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
 
 
 def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
-    """Compute nodal rays from objects: they reach the retina parallel to their direction in air.
+    """Compute nodal rays from objects (m, 3): they reach the retina parallel to their direction in air.
 
-    Args:
-        eye: the eye.
-        objects_mm: (m, 3) objects.
-        guess_mm: starting point of the search.
+    The search starts at `guess_mm`.
 
     Returns:
         Directions (m, 3) and retina points (m, 3).
@@ -148,3 +150,43 @@ def field_direction(field_rad: Floats) -> Floats:
     """Compute unit vectors (..., 3) along (1, tan h, tan v) from field angles (h, v) (..., 2) in radians."""
     field = np.asarray(field_rad, dtype=np.float64)
     return normalize(np.stack([np.ones(field.shape[:-1]), np.tan(field[..., 0]), np.tan(field[..., 1])], axis=-1))
+
+
+VERTEX_MM = 12.0
+_HEIGHT_MM = 2e-3
+_SLOPE = 1e-4
+
+
+def at_cornea_d(spectacles_d: float, vertex_mm: float = VERTEX_MM) -> float:
+    """Convert a spectacle power (D) to the refraction at the cornea (D): F / (1 - d F)."""
+    return spectacles_d / (1.0 - vertex_mm * spectacles_d / 1000.0)
+
+
+def refraction_d(eye: EyeModel, *, vertex_mm: float = VERTEX_MM) -> tuple[float, float, float]:
+    """Compute the spectacle refraction (D) about the optic axis as a power vector: sphere equivalent M, J0, J45.
+
+    The refraction in the meridian f, from nasal towards up, is M + J0 cos 2f + J45 sin 2f (Thibos, Wheeler and Horner
+    1997, Optom. Vis. Sci. 74, 367-375). Derivatives are central differences over 0.002 mm and 0.0001 rad.
+
+    Args:
+        eye: a single eye.
+        vertex_mm: distance of the spectacles from the cornea.
+
+    Raises:
+        InputError: a ray near the axis does not reach the retina.
+    """
+    path = path_to_retina(eye)
+    steps = np.array([[_HEIGHT_MM, 0, 0, 0], [0, _HEIGHT_MM, 0, 0], [0, 0, _SLOPE, 0], [0, 0, 0, _SLOPE]])
+    rays = np.concatenate([steps, -steps])
+    origin = np.column_stack([np.full(8, 1.0), rays[:, :2] - rays[:, 2:] * 1.0])
+    way = normalize(np.column_stack([np.full(8, -1.0), rays[:, 2:]]))
+    traced = trace(path, 1.0, origin, way)
+    if (traced.status != Status.OK).any():
+        raise InputError("a ray near the axis does not reach the retina", path="retina")
+    retina = traced.points_mm[-1, :, 1:]
+    change = (retina[:4] - retina[4:]).T
+    a, b = change[:, :2] / (2 * _HEIGHT_MM), change[:, 2:] / (2 * _SLOPE)
+    vergence = inverse_2x2(b) @ a
+    power = 1000.0 * vergence @ inverse_2x2(np.eye(2) + vertex_mm * vergence)
+    mean, first = (power[0, 0] + power[1, 1]) / 2, (power[0, 0] - power[1, 1]) / 2
+    return float(mean), float(first), float((power[0, 1] + power[1, 0]) / 2)

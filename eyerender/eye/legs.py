@@ -13,7 +13,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Indices, Statuses
 from ..base.status import Status
 from ..optics.interface import minus, unit
-from ..optics.shooting import connect, taken
+from ..optics.shooting import connect, correct
 from ..optics.solve import Rays, joined_rays, mirroring, refracted_rays, refracting_path
 from ..optics.surfaces import Xyz, components, join, shift, turn
 from ..optics.trace import Crossing, each
@@ -27,25 +27,15 @@ _SAME_MM = 1e-6
 
 
 class Leg(NamedTuple):
-    """Rays from a camera to points of an eye or by way of its cornea to lamps, past the lenses that are worn.
+    """Rays from a camera to points of an eye or by way of its cornea to lamps, past the lenses that are worn."""
 
-    Attributes:
-        seen: the last point on the way to the camera, where the camera sees the feature.
-        exit: the point on the cornea.
-        way: unit direction on arriving there from the camera.
-        end: unit direction in the last medium.
-        residual_mm: miss distance.
-        status: (...,).
-        passed: number of the choice of lenses passed; -1 where there is no ray.
-    """
-
-    seen: Xyz
-    exit: Xyz
-    way: Xyz
-    end: Xyz
-    residual_mm: Floats
-    status: Statuses
-    passed: Indices
+    seen: Xyz  # the last point on the way to the camera, where the camera sees the feature
+    exit: Xyz  # the point on the cornea
+    way: Xyz  # unit direction on arriving there from the camera
+    end: Xyz  # unit direction in the last medium
+    residual_mm: Floats  # miss distance
+    status: Statuses  # (...,)
+    passed: Indices  # number of the choice of lenses passed; -1 where there is no ray
 
 
 def refracted_legs(eye: EyeModel, lenses: Sequence[WornLens], target: Xyz, viewpoint: Xyz) -> Leg:
@@ -107,22 +97,26 @@ def _attempted(
 ) -> Leg:
     """Solve for the first course (lenses of the camera's leg, of the lamp's leg) that each ray (n, k) can take."""
     shape = np.broadcast_shapes(*(axis.shape for axis in (*viewpoint, *target)))
-    viewpoint, target = (each(lambda axis: np.broadcast_to(axis, shape), point) for point in (viewpoint, target))
+    starts, ends = (each(lambda axis: np.broadcast_to(axis, shape), point) for point in (viewpoint, target))
     nothing = (np.full(shape, np.nan),) * 3
     status, passed = np.full(shape, Status.NONE, np.int8), np.full(shape, -1)
     whole = Leg(nothing, nothing, nothing, nothing, nothing[0], status, passed)
     for number, (before, after) in enumerate(courses):
         may = reachable_by(lenses, before, viewpoint, None if middle else target) & reachable_by(lenses, after, target)
-        may &= whole.status != Status.OK
+        may = may & (whole.status != Status.OK)
         rows = np.flatnonzero(may.any(axis=1))
         if not len(rows):
             continue
-        some, near = [taken(crossing, rows) for crossing in middle], [lens.take(rows) for lens in lenses]
-        course = Course.of(near, before[::-1], some, after)
-        found = _one_course(course, _rows_of(viewpoint, rows), _rows_of(target, rows), thorough)
+        course, every = Course.of(lenses, before[::-1], middle, after), len(rows) == shape[0]
+        if every:
+            found = _one_course(course, starts, ends, thorough)
+        else:
+            found = _one_course(course.take(rows), _rows_of(starts, rows), _rows_of(ends, rows), thorough)
         good = may[rows] & (found.status == Status.OK)
         status = np.where(may[rows], more_telling(whole.status[rows], found.status), whole.status[rows])
         found = found._replace(passed=np.full(good.shape, number), status=np.where(good, np.int8(Status.OK), status))
+        if good.all() and every:
+            return found
         whole = each(partial(_placed, rows, good), whole, found)
         whole.status[rows] = found.status
     return whole
@@ -145,45 +139,40 @@ def _one_course(course: Course, viewpoint: Xyz, target: Xyz, thorough: bool) -> 
     eye = course.first_of_eye
     if not course.path:
         gap = unit(minus(target, viewpoint))
-        rays = Rays(target, gap, gap, np.zeros(gap[0].shape), np.zeros(gap[0].shape, np.int8))
+        zero = np.zeros(gap[0].shape)
+        rays = Rays(target, gap, gap, target, gap, zero, zero.astype(np.int8))
     else:
-        rays = joined_rays(course.path, 1.0, viewpoint, target, 0 if eye is None else eye, thorough=thorough)
-    traced, status = course.follow(viewpoint, rays.way, target)
-    status = np.where(rays.status == Status.OK, status, rays.status).astype(np.int8)
-    exit = target if eye is None else components(traced.points_mm[eye + 1])
-    way = components(traced.directions[-1 if eye is None else eye])
-    return Leg(rays.exit, exit, way, rays.end, rays.residual_mm, status, _none(status))
+        rays = joined_rays(course.path, 1.0, viewpoint, target, eye or 0, outlines=course.outlines(), thorough=thorough)
+    exit, way = (target, rays.end) if eye is None else (rays.met, rays.arriving)
+    status, ok = np.array(rays.status), rays.status == Status.OK
+    rows = np.flatnonzero((ok & (bool(course.beside()) | np.isnan(rays.met[0]))).any(axis=1))
+    if len(rows):  # these are not checked by the compiled solver, or have to keep clear of other lenses
+        ends = (_rows_of(point, rows) for point in (viewpoint, rays.way, target))
+        traced, checked = course.take(rows).follow(*ends)
+        status[rows] = np.where(ok[rows], checked, status[rows])
+        if eye is not None:
+            known = (components(traced.points_mm[eye + 1]), components(traced.directions[eye]))
+            exit, way = each(partial(_placed, rows, ok[rows]), (exit, way), known)
+    return Leg(rays.exit, exit, way, rays.end, rays.residual_mm, status.astype(np.int8), _none(status))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LensImage:
-    """A reflection of a lamp in a lens.
+    """A reflection of a lamp in a lens."""
 
-    Attributes:
-        lamp: number of the lamp.
-        surface: front or back.
-        index: number of the image in this surface; further lenses go on counting.
-        status: of the image; the numbers below are NaN where it is not OK.
-        met_mm: (3,) where light of the lamp first meets a lens.
-        seen_mm: (3,) the last point on the way to the camera.
-        mirror_mm: (3,) the mirror point.
-        leaving: (3,) unit direction in which the light leaves the lamp.
-        share: share of the light that arrives.
-        cross_section_mm2_sr: cross section of the ray tube at the lamp per solid angle at the camera.
-        residual_mm: miss distance.
-    """
-
-    lamp: int
-    surface: str
-    index: int
-    status: Status
+    lamp: int  # number of the lamp
+    surface: str  # front or back
+    index: int  # number of the image in this surface; further lenses go on counting
+    status: Status  # of the image; the numbers below are NaN where it is not OK
+    # (3,) where light of the lamp first meets a lens
     met_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
-    seen_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
-    mirror_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))
+    seen_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))  # (3,) the last point on the way to the camera
+    mirror_mm: Floats = field(default_factory=partial(np.full, 3, np.nan))  # (3,) the mirror point
+    # (3,) unit direction in which the light leaves the lamp
     leaving: Floats = field(default_factory=partial(np.full, 3, np.nan))
-    share: float = np.nan
-    cross_section_mm2_sr: float = np.nan
-    residual_mm: float = np.nan
+    share: float = np.nan  # share of the light that arrives
+    cross_section_mm2_sr: float = np.nan  # cross section of the ray tube at the lamp per solid angle at the camera
+    residual_mm: float = np.nan  # miss distance
 
 
 def lens_images(
@@ -223,33 +212,63 @@ def _add_images(
     outside = bool(lens.faces(camera))
     beside = lens.faces(lamps)[:, 0] != outside
     first, second = lens.inward() if outside else lens.outward()
+    far = getattr(lens, surface) is second.surface
     mirror = Crossing(
-        surface=getattr(lens, surface), n_after=1.0, inward=outside, reflects=True, beyond_rim=Status.MISSED
-    )
-    middle: tuple[Crossing, ...] = (mirror,)
-    if mirror.surface is second.surface:
-        middle = (first, mirror, (lens.outward() if outside else lens.inward())[1])
-    between = range(number + 1, len(lenses)) if outside else range(number)
+        surface=(second if far else first).surface, n_after=lens.index if far else 1.0, inward=outside, reflects=True,
+        beyond_rim=Status.MISSED,
+    )  # fmt: skip
+    middle = (first, mirror, (lens.outward() if outside else lens.inward())[1]) if far else (mirror,)
     seeds = _seeds(lens, mirror) if near_mm is None else components(near_mm)
+    between = range(number + 1, len(lenses)) if outside else range(number)
     for before, after in product(choices(len(between)), repeat=2):
         there = sorted((between[k] for k in before), reverse=outside)
         back = sorted((between[k] for k in after), reverse=not outside)
         course = Course.of(lenses, tuple(there), middle, tuple(back), number)
-        shot = connect(course.path, 1.0, camera, lamps, seeds)
-        start = components(np.broadcast_to(camera_mm, (*shot.status.shape, 3)))
-        traced, status = course.follow(start, shot.start, lamps)
-        good = (shot.status == Status.OK) & (status == Status.OK) & ~beside[:, None]
+        of_lamp, aims = _found_from(course, 2 * len(there) + len(middle) // 2, camera, lamps, seeds, outside)
+        of_lamp, aims = of_lamp[~beside[of_lamp]], each(lambda axis, keep=~beside[of_lamp]: axis[keep], aims)
+        if not len(of_lamp):
+            continue
+        target = components(lamps_mm[of_lamp])
+        shot = correct(course.path, 1.0, *_spread_ends(camera, target), aims)
+        traced, status = course.follow(_spread_ends(camera, target)[0], shot.start, target)
         points, leaving, share = join(shot.turning), -join(shot.end), course.share(traced)
-        for i, k in np.argwhere(good).tolist():
-            if all(np.linalg.norm(points[i, k] - other.mirror_mm) >= _SAME_MM for other in images[i]):
+        for j in np.flatnonzero((shot.status == Status.OK) & (status == Status.OK)).tolist():
+            own = images[of_lamp[j]]
+            if all(np.linalg.norm(points[j] - other.mirror_mm) >= _SAME_MM for other in own):
                 one = LensImage(
-                    lamp=i, surface=surface, index=len(images[i]), status=Status.OK,
-                    met_mm=traced.points_mm[-1, i, k], seen_mm=traced.points_mm[1, i, k],
-                    mirror_mm=points[i, k], leaving=leaving[i, k],
-                    share=float(share[i, k]), cross_section_mm2_sr=abs(float(shot.determinant_mm2_sr[i, k])),
-                    residual_mm=float(shot.residual_mm[i, k]),
+                    lamp=int(of_lamp[j]), surface=surface, index=len(own), status=Status.OK,
+                    met_mm=traced.points_mm[-1, j], seen_mm=traced.points_mm[1, j],
+                    mirror_mm=points[j], leaving=leaving[j],
+                    share=float(share[j]), cross_section_mm2_sr=abs(float(shot.determinant_mm2_sr[j])),
+                    residual_mm=float(shot.residual_mm[j]),
                 )  # fmt: skip
-                images[i].append(one)
+                own.append(one)
+
+
+def _spread_ends(camera: Xyz, target: Xyz) -> tuple[Xyz, Xyz]:
+    """Repeat the camera for each target (m,)."""
+    return each(lambda axis: np.broadcast_to(axis, target[0].shape), camera), target
+
+
+def _found_from(course: Course, mirror: int, camera: Xyz, lamps: Xyz, seeds: Xyz, outside: bool) -> tuple[Indices, Xyz]:
+    """Search the rays to lamps (m, 1) from every seed (s,) on the mirror, which is the crossing of this number.
+
+    Returns:
+        The lamp of each ray found, those of the first seeds first, and where it first meets a lens. Rays that are the
+        same to a tenth of `_SAME_MM` count once.
+    """
+    if outside:
+        rays = joined_rays(
+            course.path, 1.0, camera, lamps, mirror, outlines=course.outlines(), starts=seeds, thorough=False
+        )
+        place, first, good = rays.met, rays.exit, rays.status == Status.OK
+    else:
+        shot = connect(course.path, 1.0, camera, lamps, seeds)
+        place, first, good = shot.turning, shot.first, shot.status == Status.OK
+    seed, lamp = np.nonzero(good.T)
+    key = np.column_stack([lamp, np.round(join(place)[lamp, seed] / (0.1 * _SAME_MM))])
+    kept = np.sort(np.unique(key, axis=0, return_index=True)[1])
+    return lamp[kept], components(join(first)[lamp[kept], seed[kept]])
 
 
 def _seeds(lens: WornLens, mirror: Crossing) -> Xyz:

@@ -35,23 +35,14 @@ _WALL_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A piece of surface.
+    """A piece of surface."""
 
-    Attributes:
-        name: name of the patch.
-        vertices: (n, 3) mm.
-        normals: (n, 3) unit normals.
-        faces: (m, 3) indices of vertices.
-        exterior: refractive index on the side of the normal; None if opaque.
-        interior: refractive index behind the surface; None if opaque.
-    """
-
-    name: str
-    vertices: Floats
-    normals: Floats
-    faces: Ints
-    exterior: float | None = None
-    interior: float | None = None
+    name: str  # name of the patch
+    vertices: Floats  # (n, 3) mm
+    normals: Floats  # (n, 3) unit normals
+    faces: Ints  # (m, 3) indices of vertices
+    exterior: float | None = None  # refractive index on the side of the normal; None if opaque
+    interior: float | None = None  # refractive index behind the surface; None if opaque
 
     @property
     def mesh(self) -> Any:

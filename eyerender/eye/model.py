@@ -24,20 +24,13 @@ class Stop(ArrayValue):
     """The aperture stop (the anatomical pupil): an ellipse, or a contour about one.
 
     In a batch all arrays have a leading axis, `handed` too.
-
-    Attributes:
-        centre_mm: (3,) centre.
-        rotation: (3, 3) local to eye frame.
-        semi_axes_mm: (2,) semi-axes along local y and z.
-        handed: +1 for a right eye, -1 for a left eye.
-        contour: (2, k) c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0 for
-            an ellipse.
     """
 
-    centre_mm: Floats
-    rotation: Floats
-    semi_axes_mm: Floats
-    handed: Floats
+    centre_mm: Floats  # (3,) centre
+    rotation: Floats  # (3, 3) local to eye frame
+    semi_axes_mm: Floats  # (2,) semi-axes along local y and z
+    handed: Floats  # +1 for a right eye, -1 for a left eye
+    # (2, k) c and s of the margin's relative radius r(f) = 1 + sum_k c_k cos(k f) + s_k sin(k f); k = 0 for an ellipse
     contour: Floats = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
@@ -61,12 +54,9 @@ class Stop(ArrayValue):
         )
 
     def relative_radius(self, angle_rad: npt.ArrayLike) -> Floats:
-        """Compute the relative radius r at the parameter f of the ellipse.
+        """Compute the relative radius r at parameters f () or (m,) of the ellipse; (n, ...) for a batch of n stops.
 
         f runs from the first semi-axis of the right eye's stop towards up; for a left eye it is mirrored.
-
-        Args:
-            angle_rad: () or (m,); (n, ...) for a batch of n stops, (1, ...) if all have the same.
         """
         angle = np.asarray(angle_rad, dtype=np.float64)
         out = np.ones(angle.shape)
@@ -109,11 +99,7 @@ class Stop(ArrayValue):
         return np.asarray(sum(gap[i] * fit(self.rotation[..., i, 0], ndim) for i in range(3)))
 
     def lets_through(self, course_mm: npt.ArrayLike) -> Bools:
-        """Return whether rays pass inside the margin wherever they cross the stop's plane.
-
-        Args:
-            course_mm: (k, ..., 3) points of the rays in order, inside the eye; (k, n, ..., 3) for a batch of n stops.
-        """
+        """Return whether rays, points (k, ..., 3) inside the eye, pass inside the margin at the stop's plane."""
         course = np.asarray(course_mm, dtype=np.float64)
         passes = np.ones(course.shape[1:-1], dtype=bool)
         heights = [self.height_mm(components(points)) for points in course]
@@ -143,12 +129,7 @@ class RotationCentres(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSight(ArrayValue):
-    """The chief ray to the fovea, in air.
-
-    Attributes:
-        point_mm: (3,) where it leaves the cornea.
-        direction: (3,) outward unit vector.
-    """
+    """The chief ray to the fovea, in air: where it leaves the cornea (3,), and its outward unit direction (3,)."""
 
     point_mm: Floats
     direction: Floats

@@ -58,16 +58,9 @@ def listing_torsion(azimuth_rad: npt.ArrayLike, elevation_rad: npt.ArrayLike) ->
 
 
 def rigid_motion(poses: Poses, eye: EyeModel) -> tuple[Floats, Floats]:
-    """Compute the rigid motion of the eye: x_turned = M x + t in the eye frame.
+    """Compute the rigid motion M (n, 3, 3), t (n, 3) of n poses: x_turned = M x + t in the eye frame.
 
-    The point in the world is x_turned + the eye's position + the head's position.
-
-    Args:
-        poses: n poses.
-        eye: one eye, or a batch of n.
-
-    Returns:
-        M (n, 3, 3) and t (n, 3).
+    The point in the world is x_turned + the eye's position + the head's position. `eye` is one, or a batch of n.
     """
     angles = np.stack([poses.azimuth_rad, poses.elevation_rad, poses.torsion_rad], axis=-1).reshape(-1, 3)
     turn, shift = np.empty((len(angles), 3, 3)), np.empty((len(angles), 3))

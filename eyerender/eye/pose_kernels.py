@@ -22,11 +22,7 @@ _STEPS = 20
 def move_all(angles: Floats, centres: Floats, turn: Floats, shift: Floats) -> None:
     """Compute the rigid motions Rz(a) about c_a, Ry(-e) about c_e, Rx(t) about c_t, the last one first.
 
-    Args:
-        angles: (n, 3) a, e and t, rad.
-        centres: (1 or n, 9) c_a, c_e and c_t, mm.
-        turn: (n, 3, 3), written.
-        shift: (n, 3) mm, written.
+    `angles` (n, 3) are a, e and t; `centres` (1 or n, 9) are c_a, c_e and c_t. `turn` and `shift` are written.
     """
     for i in range(len(angles)):
         c = centres[min(i, len(centres) - 1)]
@@ -74,16 +70,11 @@ def seen(c: Floats, target: Floats, azimuth: float, elevation: float) -> tuple[P
 
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8, f8[:,::1]")
 def turn_all(centres: Floats, lines: Floats, target: Floats, largest_start_rad: float, out: Floats) -> None:
-    """Solve for the poses that turn lines fixed to eyes through targets, by Newton's method with Listing's law.
+    """Solve for the poses that turn lines fixed to eyes through targets (n, 3), by Newton's method with Listing's law.
 
-    The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target in the frame of the turned eye.
-
-    Args:
-        centres: (1 or n, 9) centres of azimuth, elevation and torsion, mm.
-        lines: (1 or n, 6) a point p and the unit direction of the line.
-        target: (n, 3).
-        largest_start_rad: limit of the first guess.
-        out: (n, 4) azimuth, elevation, the target's distance from the line and along it, written.
+    The equations are e1.(q - p) = e2.(q - p) = 0, where q is the target in the frame of the turned eye. `centres` are
+    those of `move_all`; `lines` (1 or n, 6) are a point p and the unit direction. `out` (n, 4) receives azimuth,
+    elevation, and the target's distance from the line and along it.
     """
     for i in range(len(target)):
         c, line, goal = centres[min(i, len(centres) - 1)], lines[min(i, len(lines) - 1)], target[i]

@@ -8,7 +8,7 @@ The front is a sphere with the base curve F1, so F2 = (1 - n) / R follows for bo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -18,7 +18,7 @@ from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Positive, Side, Spec, Vec2
 from ..optics.media import CauchyMedium, SellmeierMedium
 from ..optics.surfaces import Surface
-from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_graph import Biconic
 from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import rotation_x, rotation_y, rotation_z
 from .frames import SpectacleFrame
@@ -111,12 +111,24 @@ class _Solved(NamedTuple):
 OWN = "`own`: the prescription of the drawn person, for each eye, in scenes with a `population`"
 OWN_MISSING = "needs a drawn person: `population`, or person.spectacles() and person.contact_lens() in Python"
 
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "reading": {"sphere_d": 2.0, "outline_mm": (23.0, 13.0), "vertex_mm": 15.0, "pantoscopic_deg": 12.0},
+    "single vision": {"material": "1.60", "outline_mm": (25.0, 17.0)},
+    "safety": {"material": "polycarbonate", "thickness_mm": 2.2, "wrap_deg": 10.0, "outline_mm": (30.0, 23.0)},
+    "sport wrap": {"material": "polycarbonate", "thickness_mm": 2.0, "base_curve_d": 8.0, "wrap_deg": 20.0,
+                   "outline_mm": (32.0, 20.0)},
+}  # fmt: skip
+"""Keys of common glasses (chosen): single vision for powers of -6 to +6 D; safety and sport glasses are plano."""
+
 _PRESCRIBED = ("sphere_d", "cylinder_d", "axis_deg", "material", "index", "base_curve_d", "thickness_mm")
 
 
 class SpectacleLens(Spec):
     """A lens of spectacles or an insert in front of one eye: a prescription that is solved, or surfaces as made."""
 
+    preset: Literal["reading", "single vision", "safety", "sport wrap"] | None = Field(
+        default=None, description="common glasses, whose keys replace the defaults below"
+    )
     sphere_d: Dioptres = Field(default=0.0, description="back vertex power of the sphere at 546 nm, dioptres")
     cylinder_d: Dioptres = Field(default=0.0, description="cylinder at 546 nm, which acts across the axis, dioptres")
     axis_deg: Annotated[float, Field(ge=0, le=180)] = Field(
@@ -169,6 +181,14 @@ class SpectacleLens(Spec):
     )
 
     @model_validator(mode="after")
+    def _of_preset(self) -> Self:
+        """Fill in the keys of a preset that are not given."""
+        for key, value in PRESETS.get(self.preset or "", {}).items():
+            if key not in self.model_fields_set and not (key == "material" and self.index is not None):
+                self.__dict__[key] = value
+        return self
+
+    @model_validator(mode="after")
     def _check(self) -> Self:
         if self.prescription is not None:
             raise KeyProblem("prescription", OWN_MISSING)
@@ -205,12 +225,9 @@ class SpectacleLens(Spec):
         return MATERIALS[self.material or "CR-39"].index(wavelength_nm) if self.index is None else self.index
 
     def build(self, side: Side, wavelength_nm: float, head_mm: Floats | None = None) -> WornLens:
-        """Build the lens in the frame of the unrotated eye.
+        """Build the lens of one eye in the frame of the unrotated eye, for rays of a wavelength.
 
-        Args:
-            side: the eye, right or left.
-            wavelength_nm: wavelength at which rays are traced.
-            head_mm: (3,) displacement of the head, which a lens on the rig does not follow; None: none.
+        `head_mm` (3,) is the displacement of the head, which a lens on the rig does not follow.
         """
         solved, nasal = self._solved(), 1.0 if side == "right" else -1.0
         on_rig = self.mount == "rig"
@@ -357,13 +374,9 @@ Spectacles = Annotated[
 
 
 def demand_through_d(lenses: Sequence[SpectacleLens], distance_mm: Floats) -> Floats:
-    """Compute the vergence (D) that targets ask of an emmetropic eye behind lenses, all taken as thin.
+    """Compute the vergence (D) that targets ask of an emmetropic eye behind thin lenses, listed from the eye on.
 
     Light of the vergence V leaves a lens with V + F, and arrives after a distance d with V / (1 - d V).
-
-    Args:
-        lenses: in order from the eye.
-        distance_mm: of the targets from the cornea.
     """
     place = max((lens.vertex_mm for lens in lenses), default=0.0)
     vergence = -1000.0 / np.maximum(distance_mm - place, 1.0)

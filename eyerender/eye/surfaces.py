@@ -14,7 +14,7 @@ from ..optics.gradient import GradientMedium
 from ..optics.media import CauchyMedium, ConstantMedium, Medium
 from ..optics.shells import SHELLS, Layers, equator_radius_mm, even_layers, lens_shells
 from ..optics.surfaces import Surface
-from ..optics.surfaces_biconic import Biconic
+from ..optics.surfaces_graph import Biconic
 from ..optics.surfaces_quadric import Quadric
 from ..optics.transforms import rotation_x, tilt_rotation
 from .model import Sphere, Stop
@@ -81,11 +81,7 @@ def medium_of(spec: MediumSpec) -> Medium:
 
 
 def index_at(spec: MediumSpec, wavelength_nm: float, path: str) -> float:
-    """Compute the refractive index at a wavelength (nm).
-
-    Raises:
-        InputError: the index is below 1.
-    """
+    """Compute the refractive index at a wavelength (nm); InputError if it is below 1."""
     index = medium_of(spec).index(wavelength_nm)
     if not 1.0 <= index <= LARGEST_INDEX:
         raise InputError(
@@ -107,11 +103,7 @@ def sclera_of(spec: EyeParts, cornea: Surface) -> Sphere:
 
 
 def gradient_geometry(lens: GradientLensSpec) -> tuple[Surface, Surface, Floats]:
-    """Return the geometry of a gradient lens: (front, back, centre (3,)).
-
-    Raises:
-        InputError: the surfaces cannot be those of a gradient lens.
-    """
+    """Return the surfaces and centre (3,) of a gradient lens; InputError if they cannot be those of one."""
     for name, shape in (("front", lens.front.shape), ("back", lens.back.shape)):
         if not isinstance(shape, SphereSpec | ConicSpec | BiconicSpec):
             raise InputError("a gradient lens must be made of spheres, conics or biconics", path=f"lens.{name}.shape")

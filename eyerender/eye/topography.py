@@ -85,11 +85,7 @@ def read_topography(spec: TopographySpec, folder: str | Path = ".") -> GridSpec:
 
 
 def topography_files(path: str | Path) -> tuple[str, ...]:
-    """Return the paths of measured points that an eye file names, relative to its folder.
-
-    Raises:
-        InputError: the eye file cannot be read.
-    """
+    """Return the files of measured points that an eye file names, relative to its folder; InputError if unreadable."""
     found: list[str] = []
 
     def walk(node: Any) -> None:
@@ -108,11 +104,7 @@ def topography_files(path: str | Path) -> tuple[str, ...]:
 
 
 def with_topographies(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Replace the files that the shapes of an eye file name by fitted grids.
-
-    Raises:
-        InputError: naming the key or the wrong file.
-    """
+    """Replace the files that the shapes of an eye file name by fitted grids; InputError names the wrong key or file."""
 
     def walk(node: Any, path: str) -> Any:
         if isinstance(node, Mapping):

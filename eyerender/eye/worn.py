@@ -17,6 +17,7 @@ import numpy as np
 from ..base.arrays import ArrayValue, Bools, Floats, Indices, Statuses
 from ..base.status import Status, mark
 from ..optics.interface import dot, fresnel, minus, moved
+from ..optics.shooting import taken
 from ..optics.surfaces import Surface, Xyz, components, join, shift, turn_back
 from ..optics.trace import Crossing, Traced, trace
 
@@ -40,29 +41,17 @@ class FrameShape:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WornLens(ArrayValue):
-    """A lens in the frame of the unrotated eye or, `turned`, in the frames of n turned eyes; arrays may be batches.
+    """A lens in the frame of the unrotated eye or, `turned`, in the frames of n turned eyes; arrays may be batches."""
 
-    Attributes:
-        front: the surface on the world's side.
-        back: the surface on the eye's side.
-        index: index of refraction.
-        centre_mm: (3,) centre of the outline.
-        rotation: (3, 3) lens to eye frame; its x axis points out of the face.
-        half_mm: (2,) half axes of the elliptical outline along the lens's y and z.
-        reflectances: of front and back at every angle; None: Fresnel's.
-        transmission: of the material.
-        frame: what holds the lens, which pictures show; None: nothing.
-    """
-
-    front: Surface
-    back: Surface
-    index: float
-    centre_mm: Floats
-    rotation: Floats
-    half_mm: tuple[float, float]
-    reflectances: tuple[float, float] | None
-    transmission: float
-    frame: FrameShape | None = None
+    front: Surface  # the surface on the world's side
+    back: Surface  # the surface on the eye's side
+    index: float  # index of refraction
+    centre_mm: Floats  # (3,) centre of the outline
+    rotation: Floats  # (3, 3) lens to eye frame; its x axis points out of the face
+    half_mm: tuple[float, float]  # (2,) half axes of the elliptical outline along the lens's y and z
+    reflectances: tuple[float, float] | None  # of front and back at every angle; None: Fresnel's
+    transmission: float  # of the material
+    frame: FrameShape | None = None  # what holds the lens, which pictures show; None: nothing
 
     def turned(self, turn: Floats, shift_mm: Floats) -> WornLens:
         """Express the lens in frames of turned eyes, x = turn x' + shift_mm, with turn (n, 3, 3) and shift (n, 3)."""
@@ -88,10 +77,7 @@ class WornLens(ArrayValue):
 
     def inward(self) -> tuple[Crossing, ...]:
         """Return the two refractions of light that comes from the world."""
-        return (
-            Crossing(surface=self.front, n_after=self.index),
-            Crossing(surface=self.back, n_after=1.0),
-        )
+        return (Crossing(surface=self.front, n_after=self.index), Crossing(surface=self.back, n_after=1.0))
 
     def outward(self) -> tuple[Crossing, ...]:
         """Return the two refractions of light that comes from the eye."""
@@ -103,6 +89,12 @@ class WornLens(ArrayValue):
     def local(self, point: Xyz) -> Xyz:
         """Transform points to the lens's axes, with the centre of the outline as origin."""
         return turn_back(self.rotation, shift(point, self.centre_mm, -1.0))
+
+    @property
+    def outline(self) -> Floats:
+        """Centre of the outline, and both its axes over their lengths, (..., 3, 3), for the compiled solver."""
+        y, z = (self.rotation[..., :, k] / half for k, half in zip((1, 2), self.half_mm, strict=True))
+        return np.stack([self.centre_mm, y, z], axis=-2)
 
     def inside(self, point: Xyz) -> Bools:
         """Return whether points lie inside the outline, seen along the lens's x axis."""
@@ -149,13 +141,7 @@ def choices(count: int) -> list[Choice]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """A path past worn lenses.
-
-    Attributes:
-        path: the crossings, in order from the viewpoint.
-        owners: number of the lens that each crossing belongs to; None: the eye.
-        lenses: all lenses that are worn.
-    """
+    """A path past worn lenses: its crossings from the viewpoint, and the lens that each belongs to (None: the eye)."""
 
     path: tuple[Crossing, ...]
     owners: tuple[int | None, ...]
@@ -164,21 +150,13 @@ class Course:
     @classmethod
     def of(
         cls,
-        lenses: Sequence[WornLens],
-        before: Choice,
-        middle: Sequence[Crossing],
-        after: Choice = (),
-        own: int | None = None,
+        lenses: Sequence[WornLens],  # all worn lenses, in order from the eye
+        before: Choice,  # those passed on the way from the viewpoint, in the order in which they are passed
+        middle: Sequence[Crossing],  # the crossings of the eye, or those of lens `own` if that is given
+        after: Choice = (),  # those passed on the way to the target, in the order in which they are passed
+        own: int | None = None,  # number of a lens that reflects the ray
     ) -> Course:
-        """Join what the lenses before and after do to the crossings in the middle.
-
-        Args:
-            lenses: all worn lenses, in order from the eye.
-            before: those passed on the way from the viewpoint, in the order in which they are passed.
-            middle: the crossings of the eye, or those of lens `own` if that is given.
-            after: those passed on the way to the target, in the order in which they are passed.
-            own: number of a lens that reflects the ray.
-        """
+        """Join what the lenses before and after do to the crossings in the middle."""
         inwards = own is None or all(k > own for k in (*before, *after))
         steps = [(c, k) for k in before for c in (lenses[k].inward() if inwards else lenses[k].outward())]
         back = [(c, k) for k in after for c in (lenses[k].outward() if inwards else lenses[k].inward())]
@@ -217,11 +195,7 @@ class Course:
         return whole
 
     def follow(self, viewpoint: Xyz, way: Xyz, target: Xyz) -> tuple[Traced, Statuses]:
-        """Trace rays from the viewpoint, and check that they pass lenses inside their outlines only.
-
-        Returns:
-            The traced rays, and their statuses: AT_LENS_EDGE where a lens lies in the way or ends too early.
-        """
+        """Trace rays from the viewpoint; the status is AT_LENS_EDGE where a lens lies in the way or ends too early."""
         traced = trace(self.path, 1.0, join(viewpoint), join(way))
         status = np.array(traced.status)
         points = [viewpoint, *(components(p) for p in traced.points_mm[1:]), target]
@@ -229,12 +203,27 @@ class Course:
             for k, owner in enumerate(self.owners):
                 if owner is not None:
                     mark(status, ~self.lenses[owner].inside(points[k + 1]), Status.AT_LENS_EDGE)
-            for k in self._in_air():
-                ends = {self.owners[i] for i in (k - 1, k) if 0 <= i < len(self.owners)}
-                for j, lens in enumerate(self.lenses):
-                    if j not in ends:
-                        mark(status, lens.touches(points[k], points[k + 1]), Status.AT_LENS_EDGE)
+            for k, lens in self.beside():
+                mark(status, lens.touches(points[k], points[k + 1]), Status.AT_LENS_EDGE)
         return traced, status
+
+    def outlines(self) -> Floats:
+        """Return the outline of each crossing, (..., s, 3, 3), with axes of 0 at those of the eye."""
+        owned = [np.zeros((3, 3)) if k is None else self.lenses[k].outline for k in self.owners]
+        return np.stack(np.broadcast_arrays(*owned), axis=-3)
+
+    def beside(self) -> list[tuple[int, WornLens]]:
+        """Return the segments in air and the lenses that they must not touch; segment k ends at crossing k."""
+        out = []
+        for k in self._in_air():
+            ends = {self.owners[i] for i in (k - 1, k) if 0 <= i < len(self.owners)}
+            out += [(k, lens) for j, lens in enumerate(self.lenses) if j not in ends]
+        return out
+
+    def take(self, rows: Indices) -> Course:
+        """Select rows of a batch."""
+        path, lenses = tuple(taken(c, rows) for c in self.path), tuple(lens.take(rows) for lens in self.lenses)
+        return replace(self, path=path, lenses=lenses)
 
     def _in_air(self) -> list[int]:
         """Return the numbers of the segments in air; segment k ends at crossing k."""
@@ -252,7 +241,7 @@ def reachable_by(lenses: Sequence[WornLens], choice: Choice, end: Xyz, towards: 
     found = np.ones(np.shape(end[0]), dtype=bool)
     nothing = np.zeros(found.shape)
     for k in choice:
-        found &= lenses[k].reachable(end, towards or (nothing, nothing, nothing))
+        found = found & lenses[k].reachable(end, towards or (nothing, nothing, nothing))
     return found
 
 

@@ -82,10 +82,7 @@ def picture_bytes(picture: NDArray[Any]) -> bytes:
     values = np.ascontiguousarray(picture, dtype="<f2" if picture.dtype == np.float16 else "<f4")
     out = io.BytesIO()
     # A higher level takes longer and saves less than 2 %.
-    with (
-        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-        archive.open(_ARRAY, "w") as file,
-    ):
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive, archive.open(_ARRAY, "w") as file:
         np.lib.format.write_array(file, values, version=(1, 0))
     return out.getvalue()
 

@@ -243,11 +243,7 @@ class ImageEntry:
 
     @property
     def labels(self) -> dict[str, Any]:
-        """Labels of the image (docs/formats.md), empty if it has none.
-
-        Raises:
-            InputError: the labels are not a mapping.
-        """
+        """Labels of the image (docs/formats.md), empty if it has none; InputError if the labels are not a mapping."""
         found = self.line.get("labels")
         if found is None:
             return {}
@@ -277,11 +273,7 @@ class ImageEntry:
         return image
 
     def truth(self) -> Observations:
-        """Read the records of the analytic observer for this image.
-
-        Raises:
-            InputError: naming line and key.
-        """
+        """Read the records of the analytic observer for this image; InputError naming line and key."""
         try:
             return Observations.from_records(self.records, complete=True)
         except InputError as error:
@@ -440,11 +432,7 @@ class ImageFolder:
         return np.array(found, dtype=np.int64)
 
     def truth(self) -> Observations:
-        """Read the records of the analytic observer for every image, in order.
-
-        Raises:
-            InputError: a record is wrong.
-        """
+        """Read the records of the analytic observer for every image, in order; InputError if a record is wrong."""
         parts = []
         for start in range(0, len(self.entries), _BATCH):
             batch = list(self.entries[start : start + _BATCH])
@@ -468,11 +456,7 @@ def opened_entries(path: str) -> Entries:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """Read run.json.
-
-    Raises:
-        InputError: there is none, or it is damaged or of another version.
-    """
+    """Read run.json; InputError if there is none, or it is damaged or of another version."""
     run = read_json(folder / RUN, follow=False)
     if run.get("schema") not in (RUN_SCHEMA, PACKED_RUN_SCHEMA):
         raise InputError("does not describe a run of this version", source=str(folder / RUN))

@@ -85,12 +85,7 @@ def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
 
 
 def has_own_name(folder: Path, file: Path) -> bool:
-    """Return whether a file has a name that this package gives, is listed as made by it, or is a picture.
-
-    Args:
-        folder: the folder.
-        file: a path below it.
-    """
+    """Return whether a file below a folder has a name of this package, is listed as made by it, or is a picture."""
     return file.suffix.lower() in _PICTURES or _is_ours(
         file.relative_to(folder).as_posix(), False, _listed(folder) or set()
     )
@@ -100,11 +95,8 @@ def clear(folder: Path, *, known: bool = False) -> None:
     """Remove everything that this package made in a folder, and remains of killed runs; locks stay.
 
     dataset.json is removed first, so that a partial dataset does not look complete. The marker is removed last, so that
-    an interrupted removal can be repeated. Nothing is removed if something else is found.
-
-    Args:
-        folder: the folder.
-        known: whether the caller knows that the folder belongs to a run, even if its identifying files are damaged.
+    an interrupted removal can be repeated. Nothing is removed if something else is found. `known` says that the folder
+    belongs to a run, even if its identifying files are damaged.
 
     Raises:
         InputError: as `refuse_non_empty` with `overwrite`.

@@ -200,11 +200,7 @@ def _block(path: str, first: int, state: tuple[int, ...]) -> list[bytes]:
 
 
 def _inflated(path: str, first: int) -> list[bytes]:
-    """Read the lines of the gzip member that begins at a byte.
-
-    Raises:
-        InputError: there is no member, or it is too large.
-    """
+    """Read the lines of the gzip member that begins at a byte; InputError if there is no member, or it is too large."""
     try:
         with opened(path, follow=False) as file:
             file.seek(first)
@@ -280,11 +276,7 @@ class PackedLines:
 
     @cached_property
     def rows(self) -> NDArray[Any]:
-        """Return the rows of the index, (n,) of `INDEX_TYPE`.
-
-        Raises:
-            InputError: the file is not such an index.
-        """
+        """Return the rows of the index, (n,) of `INDEX_TYPE`; InputError if the file is not such an index."""
         if self.given is not None:
             return self.given
         assert self.file is not None

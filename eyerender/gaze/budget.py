@@ -117,11 +117,7 @@ class ErrorBudget:
     frames_missing: int
 
     def cause(self, name: str, *, transferred: bool = False) -> Cause:
-        """Return a cause by its name.
-
-        Raises:
-            InputError: there is no such cause.
-        """
+        """Return a cause by its name; InputError if there is no such cause."""
         for cause in self.transferred if transferred else self.causes:
             if cause.name == name:
                 return cause
@@ -245,10 +241,7 @@ class Displacement:
 def displacement(before: Floats, after: Floats, eye: Ints) -> Displacement:
     """Split gaze displacements into shift, pattern and scatter, equation (9).
 
-    Args:
-        before: (s, n, 2) error vectors of n frames in degrees; s is 1, or the number of seeds of `after`.
-        after: (s, n, 2) error vectors with s seeds.
-        eye: (n,) the eye of each frame.
+    `before` and `after` are error vectors (s, n, 2) of n frames in degrees, with s seeds; s may be 1 for `before`.
     """
     moved = after - before
     seeds, frames = moved.shape[:2]

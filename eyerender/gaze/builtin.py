@@ -37,11 +37,7 @@ class EstimatorOptions(Spec):
 
 
 def this_many(lights: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """Return the lights of an option, of which an estimator needs `count`.
-
-    Raises:
-        InputError: there are more or fewer.
-    """
+    """Return the lights of an option, of which an estimator needs `count`; InputError if there are more or fewer."""
     if len(lights) != count:
         raise InputError(f"must be {count} light{'s' if count > 1 else ''} for this estimator", path="lights")
     return lights
@@ -66,11 +62,7 @@ class BuiltIn(StoredEstimator):
 
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
-        """Create the estimator, not calibrated.
-
-        Raises:
-            InputError: an option is wrong.
-        """
+        """Create the estimator, not calibrated; InputError if an option is wrong."""
         return cls(**{name: getattr(options, name) for name in cls.OPTIONS})
 
     def options(self) -> EstimatorOptions:
@@ -83,11 +75,7 @@ class BuiltIn(StoredEstimator):
         return {eye: self.EYE(**{self.ARRAY: one}) for eye, one in found.items()} if self.ARRAY else found
 
     def with_eyes(self, eyes: Mapping[int, Any]) -> Self:
-        """Return a copy with the calibrations that `eyes` returns.
-
-        Raises:
-            InputError: they do not fit the options.
-        """
+        """Return a copy with the calibrations that `eyes` returns; InputError if they do not fit the options."""
         if self.ARRAY:
             eyes = {eye: frozen(getattr(record, self.ARRAY)) for eye, record in eyes.items()}
         return replace(self, **{self.BY_EYE: eyes})
@@ -106,11 +94,7 @@ class BuiltIn(StoredEstimator):
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any]) -> Self:
-        """Create the calibrated estimator.
-
-        Raises:
-            InputError: naming the key.
-        """
+        """Create the calibrated estimator; InputError naming the key."""
         try:
             estimator = cls.of(EstimatorOptions.from_mapping(data.get("estimator")))
         except InputError as error:

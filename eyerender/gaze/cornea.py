@@ -28,20 +28,14 @@ COPLANAR = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorneaCentres(ArrayValue):
-    """Centres of corneal curvature.
+    """Centres of corneal curvature."""
 
-    Attributes:
-        centre_mm: (..., 3) centres.
-        distance_mm: (..., m) distances of the mirror points along their rays.
-        residual_mm: (...) root mean square distance of the single glints' centres from their mean (method A), or
-            distance of the centre from the line on which it must lie (method B).
-        ok: (...) False where no centre was found.
-    """
-
-    centre_mm: Floats
-    distance_mm: Floats
+    centre_mm: Floats  # (..., 3) centres
+    distance_mm: Floats  # (..., m) distances of the mirror points along their rays
+    # (...) root mean square distance of the single glints' centres from their mean (method A), or distance of the
+    # centre from the line on which it must lie (method B)
     residual_mm: Floats
-    ok: Bools
+    ok: Bools  # (...) False where no centre was found
 
 
 def centres_of(
@@ -49,11 +43,7 @@ def centres_of(
 ) -> tuple[Floats, Bools]:
     """Compute centres (..., n, 3) of the rows' corneas, each from the glints that it has, and whether it has one.
 
-    Args:
-        rays: rays of all observations.
-        rows: (n,) observations.
-        radius_mm: (..., n) corneal radius.
-        find: the method, `from_all_glints` (default) or `from_plane`.
+    The radius is (..., n); `find` is the method, `from_all_glints` (default) or `from_plane`.
     """
     centre, ok = np.full((*radius_mm.shape, 3), np.nan), np.zeros(radius_mm.shape, dtype=bool)
     for part, columns in with_equal_glints(rays.glints[rows]):

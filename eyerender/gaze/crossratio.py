@@ -53,11 +53,7 @@ class CrossRatio(BuiltIn):
 
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
-        """Create the estimator, not calibrated.
-
-        Raises:
-            InputError: the lights are not five.
-        """
+        """Create the estimator, not calibrated; InputError if the lights are not five."""
         a, b, c, d, camera = this_many((0, 1, 2, 3, 4) if options.lights is None else options.lights, 5)
         return cls((a, b, c, d), camera)
 

@@ -74,11 +74,7 @@ class DirectionRegression(PolynomialEstimator[DirectionFit]):
 
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
-        """Create the estimator, not calibrated.
-
-        Raises:
-            InputError: there is no such function.
-        """
+        """Create the estimator, not calibrated; InputError if there is no such function."""
         return cls(options.terms or options.function, options.feature, options.lights).with_eyes({})
 
     def options(self) -> EstimatorOptions:

@@ -98,11 +98,7 @@ class GazeEstimator(Protocol):
     __slots__ = ()
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate on observations of known targets (n, 3) mm.
-
-        Raises:
-            InputError: a calibration is impossible.
-        """
+        """Calibrate on observations of known targets (n, 3) mm; InputError if a calibration is impossible."""
         ...
 
     def predict(self, observations: Observations, rig: RigLike) -> GazePoints:

@@ -207,21 +207,13 @@ class GuestrinEizenman(BuiltIn):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Goals:
-    """Targets (n) as points on planes: on the screen, or each on its own plane if there is no screen.
+    """Targets (n) as points on planes: on the screen, or each on its own plane if there is no screen."""
 
-    Attributes:
-        origin_mm: (n, 3) a point of the plane.
-        axes: (n, 3, 3) right, up and normal of the plane in the columns.
-        wanted: (n, 2) the targets on their planes, mm.
-        off_plane: (n,) their distances from the planes, mm.
-        weight: (n, 1) factor of a miss.
-    """
-
-    origin_mm: Floats
-    axes: Floats
-    wanted: Floats
-    off_plane: Floats
-    weight: Floats
+    origin_mm: Floats  # (n, 3) a point of the plane
+    axes: Floats  # (n, 3, 3) right, up and normal of the plane in the columns
+    wanted: Floats  # (n, 2) the targets on their planes, mm
+    off_plane: Floats  # (n,) their distances from the planes, mm
+    weight: Floats  # (n, 1) factor of a miss
 
     @classmethod
     def of(cls, observations: Observations, screen: ScreenPlane | None) -> _Goals:

@@ -55,11 +55,7 @@ class Hennessey(Recalibrated):
         return EstimatorOptions(index=index, recalibration=self.recalibration, lights=self.lights)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate the correction of each eye.
-
-        Raises:
-            InputError: there are fewer than six usable targets.
-        """
+        """Calibrate the correction of each eye; InputError if there are fewer than six usable targets."""
         rig = rig.build()
         rays = self.optic_axes(observations, rig)
         return replace(self, correction=Recalibration(self.recalibration).fit(observations, rays, rig))

@@ -57,11 +57,7 @@ class Homography(BuiltIn):
 
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
-        """Create the estimator, not calibrated.
-
-        Raises:
-            InputError: the lights are not four.
-        """
+        """Create the estimator, not calibrated; InputError if the lights are not four."""
         a, b, c, d = this_many(cls().lights if options.lights is None else options.lights, 4)
         return cls((a, b, c, d))
 
@@ -70,11 +66,7 @@ class Homography(BuiltIn):
         return EstimatorOptions(lights=self.lights)
 
     def fit(self, observations: Observations, rig: RigLike) -> Self:
-        """Calibrate H_c of each eye.
-
-        Raises:
-            InputError: there are fewer than four targets, or they are collinear.
-        """
+        """Calibrate H_c of each eye; InputError if there are fewer than four targets, or they are collinear."""
         rig = rig.build()
         wanted = targets_on_screen(observations, screen_of(rig))
         s, reason = self.normalised(observations, rig)

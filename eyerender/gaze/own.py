@@ -66,11 +66,7 @@ class OwnEstimator:
         return gaze
 
     def check_storable(self) -> None:
-        """Check before a calibration that it can be written to a file.
-
-        Raises:
-            InputError: it cannot.
-        """
+        """Check before a calibration that it can be written to a file; InputError if it cannot."""
         if not isinstance(self.estimator, StoredEstimator):
             reason = (
                 "has no to_mapping and from_mapping, so its calibration cannot be stored (see er.gaze.StoredEstimator)"
@@ -78,11 +74,7 @@ class OwnEstimator:
             raise InputError(reason, source=self.reference)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the name of the class and its calibration, as stored in files.
-
-        Raises:
-            InputError: it cannot be stored.
-        """
+        """Return the name of the class and its calibration, as stored in files; InputError if it cannot be stored."""
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
         if not is_reference(self.reference):
@@ -95,11 +87,7 @@ class OwnEstimator:
         return {"estimator": {"reference": self.reference}, "state": state}
 
     def restored(self, state: Any) -> Self:
-        """Restore the estimator from the calibration in a file.
-
-        Raises:
-            InputError: the class raises an error.
-        """
+        """Restore the estimator from the calibration in a file; InputError if the class raises an error."""
         self.check_storable()
         assert isinstance(self.estimator, StoredEstimator)
         if not isinstance(state, dict):

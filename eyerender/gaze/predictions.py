@@ -182,15 +182,9 @@ def _screen_angles(point_mm: Floats, eye_mm: Floats, screen: ScreenPlane | None)
 
 
 def refuse_nothing(data: dict[str, Any], calibrated: Sequence[str], *, source: str) -> None:
-    """Raise an error if `predictions` estimated nothing: with the reason of most records.
+    """Raise InputError, with the reason of most records, if `predictions` estimated nothing.
 
-    Args:
-        data: the result of `predictions`.
-        calibrated: eyes that the calibration knows.
-        source: name of the records in the message.
-
-    Raises:
-        InputError: no record has an estimate.
+    The message names `source`, and the eyes that the calibration knows (`calibrated`).
     """
     entries = data["gaze"]
     if any(entry["status"] == "ok" for entry in entries):

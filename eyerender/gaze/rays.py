@@ -24,36 +24,22 @@ NOT_CALIBRATED = "this eye is not calibrated"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureRays(ArrayValue):
-    """Rays through the features of n observations.
+    """Rays through the features of n observations."""
 
-    Attributes:
-        origin_mm: (n, 3) nodal points.
-        pupil: (n, 3) unit rays to the pupil centre.
-        glints: (n, m, 3) unit rays to the glints; NaN where a frame lacks one.
-        light_mm: (n, m, 3) lights of the glints.
-        reason: (n,) why an observation has no rays, None where it has.
-    """
-
-    origin_mm: Floats
-    pupil: Floats
-    glints: Floats
-    light_mm: Floats
-    reason: Objects
+    origin_mm: Floats  # (n, 3) nodal points
+    pupil: Floats  # (n, 3) unit rays to the pupil centre
+    glints: Floats  # (n, m, 3) unit rays to the glints; NaN where a frame lacks one
+    light_mm: Floats  # (n, m, 3) lights of the glints
+    reason: Objects  # (n,) why an observation has no rays, None where it has
 
 
 def feature_rays(
     observations: Observations, rig: RigGeometry, lights: Sequence[int] | None, *, least: int
 ) -> FeatureRays:
-    """Compute rays through the pupil centre and the glints.
-
-    Args:
-        observations: n observations.
-        rig: the rig that observed them.
-        lights: lights of the glints, as for `chosen_lights`.
-        least: how many glints an observation must have, and lights the rig.
+    """Compute rays through the pupil centre and the glints of n observations, which need `least` glints or more.
 
     Raises:
-        InputError: the rig has fewer than `least` lights, or not those that are named.
+        InputError: the rig has fewer than `least` lights, or not those that are named (see `chosen_lights`).
     """
     wanted = chosen_lights(observations, rig, lights, least)
     camera, reason = camera_of(observations, rig)

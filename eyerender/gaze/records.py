@@ -220,11 +220,7 @@ class _RigData(Spec):
 
 
 def rig_from_mapping(data: Any, *, source: str = "") -> RigGeometry:
-    """Read a rig as `features --json` writes it; unknown keys are ignored.
-
-    Raises:
-        InputError: naming the part that is wrong.
-    """
+    """Read a rig as `features --json` writes it; unknown keys are ignored. InputError names the part that is wrong."""
     try:
         return _RigData.from_mapping(data).build()
     except InputError as error:

@@ -26,16 +26,7 @@ from ..scene.observation import Observations
 from .builtin import BuiltIn, EstimatorOptions, this_many
 from .determined import Terms, UndeterminedWarning, is_determined, monomials, shortfall
 from .estimate import GazePoints
-from .rays import (
-    calibrated_eyes,
-    chosen_lights,
-    eye_name,
-    eyes_of,
-    glints_of,
-    is_none,
-    screen_of,
-    targets_on_screen,
-)
+from .rays import calibrated_eyes, chosen_lights, eye_name, eyes_of, glints_of, is_none, screen_of, targets_on_screen
 
 
 def _terms(text: str) -> Terms:
@@ -102,20 +93,12 @@ class PolynomialEstimator(BuiltIn, Generic[Fit]):
     fits: Mapping[int, Fit]
 
     def __post_init__(self) -> None:
-        """Check the function where it is written.
-
-        Raises:
-            InputError: there is no such function.
-        """
+        """Check the function where it is written; InputError if there is no such function."""
         _ = self.terms
 
     @property
     def terms(self) -> tuple[Terms, Terms]:
-        """Exponents of the terms of both polynomials.
-
-        Raises:
-            InputError: there is no such function.
-        """
+        """Exponents of the terms of both polynomials; InputError if there is no such function."""
         if isinstance(self.function, str):
             if self.function not in FUNCTIONS:
                 near = nearest(self.function, FUNCTIONS) + "there are R1 to R12"
@@ -183,11 +166,7 @@ class Regression(PolynomialEstimator[PolynomialFit]):
 
     @classmethod
     def of(cls, options: EstimatorOptions) -> Self:
-        """Create the estimator, not calibrated.
-
-        Raises:
-            InputError: there is no such function.
-        """
+        """Create the estimator, not calibrated; InputError if there is no such function."""
         (light,) = this_many((0,) if options.lights is None else options.lights, 1)
         return cls(options.terms or options.function, light, normalised=options.normalised).with_eyes({})
 

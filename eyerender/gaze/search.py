@@ -37,11 +37,7 @@ class FreeParameters:
     """
 
     def __init__(self, start: EyeParameters, bounds: ParameterBounds, free: Bools) -> None:
-        """Select the free parameters.
-
-        Raises:
-            InputError: the start lies outside the bounds.
-        """
+        """Select the free parameters; InputError if the start lies outside the bounds."""
         self.start, self.free, self.first = start, free, start.vector()
         self.low, self.high = bounds.lower.vector()[free], bounds.upper.vector()[free]
         self.scale = _SCALE[free]
@@ -90,11 +86,7 @@ class FreeParameters:
 def calibrate(
     misses: Misses, start: EyeParameters, bounds: ParameterBounds, free: Bools, tolerance: float
 ) -> Calibration:
-    """Minimise the sum of squared misses over the free parameters within `bounds`; the others stay as in `start`.
-
-    Raises:
-        InputError: the start lies outside the bounds.
-    """
+    """Minimise the squared misses over the free parameters within `bounds`; InputError if the start is outside."""
     space = FreeParameters(start, bounds, free)
 
     def total(parameters: Floats) -> Floats:

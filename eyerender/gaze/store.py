@@ -45,27 +45,20 @@ def choose_estimator(given: str, *, source: str = "--estimator", **options: Any)
 
 
 def fit_estimator(
-    estimator: GazeEstimator,
-    observations: Observations,
-    rig: RigGeometry,
-    fixations: Sequence[int] | None = None,
+    estimator: GazeEstimator,  # the estimator, not calibrated
+    observations: Observations,  # observations of known targets
+    rig: RigGeometry,  # the rig that observed them
+    fixations: Sequence[int] | None = None,  # fixations for the calibration, counted from 0; None: all
     *,
-    source: str = "",
+    source: str = "",  # name of the observations in messages
+    # called for targets off the screen, features in conventions that do not fit the rig, targets that do not determine
+    # the estimator, and a calibration that misses its own targets; it may raise
     warn: Warn | None = None,
 ) -> tuple[GazeEstimator, dict[str, Any]]:
     """Calibrate an estimator on the records that are right, and summarise the result (schema eyerender/gaze-fit/3).
 
     Records are left out if the extractor is unsure of their pupil, or if pupil or glints lie far from where those of
     the other targets put them (`screening.py`).
-
-    Args:
-        estimator: the estimator, not calibrated.
-        observations: observations of known targets.
-        rig: the rig that observed them.
-        fixations: fixations for the calibration, counted from 0; None: all.
-        source: name of the observations in messages.
-        warn: called for targets off the screen, features in conventions that do not fit the rig, targets that do not
-            determine the estimator, and a calibration that misses its own targets; it may raise.
 
     Raises:
         InputError: there are no targets, a fixation does not exist, or the estimator cannot be calibrated.
@@ -226,11 +219,7 @@ def _calibration(data: Mapping[str, Any], described: Mapping[str, Any]) -> Built
 
 
 def _own_calibration(data: Mapping[str, Any], reference: object, own: str | None) -> OwnEstimator:
-    """Read the calibration of a user's own class.
-
-    Raises:
-        InputError: `own` is not the class that the file names.
-    """
+    """Read the calibration of a user's own class; InputError if `own` is not the class that the file names."""
     at = "estimator.reference"
     if own is None:
         made_by = f"was made by {shown(reference)}, which no file can have loaded"

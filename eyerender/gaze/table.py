@@ -573,10 +573,8 @@ def with_targets(
 def features_csv(observations: Observations, lights: int | None) -> str:
     """Format observations as a table that `observations_from_csv` reads (docs/own_data.md).
 
-    Args:
-        observations: the observations.
-        lights: number of lights of the rig; None: glints of unknown lights are written as `spot0_x`, ..., which are not
-            read as glints of lights.
+    `lights` is the number of lights of the rig. None: glints of unknown lights are written as `spot0_x`, ..., which are
+    not read as glints of lights.
     """
     index, pupil, glints = observations.index, observations.pupil, observations.glints
     several = bool((index.camera > 0).any())

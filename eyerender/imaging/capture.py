@@ -14,9 +14,9 @@ from ..backends.choose import BackendChoice, choose_backend
 from ..base.arrays import Bytes, Floats, Singles
 from ..base.errors import InputError
 from ..base.progress import COMPILING, Progress, followed_by, one_behind
+from ..eye.landmarks import at_cornea_d
 from ..eye.legs import apparent_places
 from ..eye.model import EyeModel
-from ..eye.refraction import at_cornea_d
 from ..folders.imagefile import MAX_PIXELS, compressed
 from ..region.anatomy import Region
 from ..rig.camera import Window
@@ -253,6 +253,10 @@ def render_job(frames: RenderableFrames, row: int) -> RenderJob:
         lens=scene.spec.lens,
         ambient=scene.ambient,
         mesh_edge_mm=scene.spec.image.mesh_edge_mm if scene.spec.image.surfaces == "mesh" else None,
+        purkinje=(
+            1,
+            *(order for order in scene.spec.image.purkinje if order in scene.eye_at(index, row).purkinje_orders),
+        ),
         interreflection=scene.spec.image.interreflection,
         wavelength_nm=scene.spec.wavelength_nm,
         seed=int(seeds.generate_state(1, np.uint64)[0]),
@@ -292,6 +296,8 @@ def check_windows(scene: RenderableScene) -> None:
     """
     if scene.spec.image.surfaces == "mesh":
         scene.refuse_spectacles("meshes of the eye are rendered")
+    if scene.spec.image.purkinje:
+        scene.refuse_spectacles("further Purkinje images are rendered")
     if scene.rig.obstacles and scene.region is not None and scene.region.head is not None:
         raise InputError("are not drawn around head meshes so far", path="rig.obstacles")
     spp = scene.spec.image.spp

@@ -65,11 +65,13 @@ def budget_steps(
         progress: called with (images done, images in all, note).
 
     Raises:
-        InputError: the frames have no targets, or seeds < 1.
+        InputError: the frames have no targets or are those of a sequence, or seeds < 1.
         BackendError: no backend can render.
     """
     if seeds < 1:
         raise InputError(f"must be >= 1, not {seeds}", path="seeds")
+    if frames.scene.spec.sequence is not None:
+        raise InputError("has no fixations to calibrate on; a budget needs a scene with targets", path="sequence")
     if not np.isfinite(frames.index.target_mm).all():
         raise InputError("there are no targets to compare the gaze with; use a scene with targets")
     exact = trace(frames)

@@ -9,6 +9,7 @@ pupil, or of iris and pupil together): semi-axes 2 sqrt(eigenvalues of covarianc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.interpolate import CubicSpline
 
+from ..analytic.observer import AnalyticObserver
 from ..base.arrays import Bools, Bytes, Floats, finite_or_none, remembered
 from ..base.errors import InputError
 from ..base.status import Status
@@ -28,6 +30,7 @@ from ..region.anatomy import Region
 from ..region.limbus import lower
 from ..region.mesh import lid_margins
 from ..rendering.records.job import globe_of
+from ..rendering.scene.pixels import lid_margins_px
 from ..rig.camera import PinholeCamera, Window, in_window
 from ..rig.rig import RigGeometry
 from ..scene.observation import EYES, Index, Observations
@@ -99,6 +102,7 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
     whole_px = {name: whole_pixels(done.labels.amodal, known, name, window) for name in ("pupil", "iris")}
     points = truth.pupil.points_px[image.row]
     whole = bool(truth.pupil.ok[image.row]) and len(points) > 2
+    shifts = glint_shifts_px(image.scene, image, truth)
     return {
         "eye_present": known["eye_present"],
         "pupil": {
@@ -113,10 +117,12 @@ def image_labels(image: EyeImage, truth: Observations) -> dict[str, Any]:
             "visible_fraction": finite_or_none(done.labels.visible_fraction(IRIS, whole_px["iris"])),
         },
         "glints": [
-            glint | _seen_glint(image, k, reason)
+            glint | _seen_glint(image, k, reason, shifts[glint["light"]])
             for k, (glint, reason) in enumerate(zip(known["glints"], done.glint_reasons, strict=True))
         ],
-        "lid_margins_px": done.lid_margins_px,
+        "lid_margins_px": lid_landmarks(image.scene, image)
+        if _is_rolling(image.scene, image) and done.lid_margins_px is not None
+        else done.lid_margins_px,
         **{key: known[key] for key in ("lid_opening", "space", "globe_radius_mm", "pose", "camera", "lights_mm")},
         "failed_paths": int(done.failed_paths),
     }
@@ -298,21 +304,72 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
         (None if it is).
     """
     pixels, reason = _limbus_now(scene, view, count)
-    index = view.frame.index
-    timing = scene.timings[view.camera]
-    if not timing.is_rolling or not np.isfinite(index.start_s[0]):
-        return pixels, reason
+    return _at_own_rows(scene, view, pixels, lambda one: _limbus_now(scene, one, count)[0]), reason
+
+
+def _is_rolling(scene: RenderableScene, view: EyeInWindow | EyeImage) -> bool:
+    """Return whether the rows of a view are exposed one after the other."""
+    return scene.timings[view.camera].is_rolling and bool(np.isfinite(view.frame.index.start_s[0]))
+
+
+def _at_own_rows(
+    scene: RenderableScene, view: EyeInWindow | EyeImage, pixels: Floats, points: Callable[[EyeInWindow], Floats]
+) -> Floats:
+    """Move points (n, 2) of an image to where they are at the times of their own rows.
+
+    Args:
+        scene: the scene.
+        view: the eye; without a rolling shutter, its points stay.
+        pixels: its points, in full-sensor px.
+        points: computes the points at other times.
+    """
+    if not _is_rolling(scene, view):
+        return pixels
+    index, timing = view.frame.index, scene.timings[view.camera]
     start = float(index.start_s[0])
     times = np.linspace(start, start + timing.rows * timing.row_s + timing.exposure_s, _ROW_TIMES)
     moving = view.frame.at([0] * _ROW_TIMES, times)
-    views = [EyeInWindow.of(moving, k) for k in range(_ROW_TIMES)]
-    way = CubicSpline(times, [_limbus_now(scene, one, count)[0] for one in views])
-    lights, each = np.array(scene.rig.lights_of(int(index.eye[0])), dtype=np.int64), np.arange(count)
+    way = CubicSpline(times, [points(EyeInWindow.of(moving, k)) for k in range(_ROW_TIMES)])
+    lights, each = np.array(scene.rig.lights_of(int(index.eye[0])), dtype=np.int64), np.arange(len(pixels))
     for _ in range(_ROW_STEPS):
         own = timing.seen([start], pixels[None, :, 1], lights).time_s[0]
         own = np.where(np.isfinite(own), own, timing.ambient_s(start, pixels[:, 1]))
         pixels = way(own)[each, each]
-    return pixels, reason
+    return pixels
+
+
+def lid_landmarks(scene: RenderableScene, view: EyeInWindow | EyeImage) -> dict[str, list[list[float]]] | None:
+    """Compute the landmarks along the lids in px, without an image; None for a bare eye and for a head mesh.
+
+    Under a rolling shutter each is that of its own row's time.
+    """
+
+    def marks(one: EyeInWindow | EyeImage) -> Floats | None:
+        assert one.region is not None
+        margins = lid_margins(one.region, globe_of(one.eye, one.M, one.t - one.apex_mm))
+        camera = past_lenses(one.rig.cameras[one.camera], one.eye.worn, one.apex_mm)
+        both = lid_margins_px(margins, camera, one.apex_mm)
+        return None if both is None else np.concatenate([both["upper"], both["lower"]])
+
+    if view.region is None or view.region.head is not None or (now := marks(view)) is None:
+        return None
+
+    def then(one: EyeInWindow) -> Floats:
+        found = marks(one)
+        return np.full_like(now, np.nan) if found is None else found
+
+    own, half = np.round(_at_own_rows(scene, view, now, then), 4), len(now) // 2
+    return {"upper": own[:half].tolist(), "lower": own[half:].tolist()}
+
+
+def glint_shifts_px(scene: RenderableScene, view: EyeInWindow | EyeImage, truth: Observations) -> Floats:
+    """Return how far (lights, 2) each light's glint moves from mid-exposure to the time of its own row."""
+    count = len(scene.rig.lights)
+    if not _is_rolling(scene, view):
+        return np.zeros((count, 2))
+    middle = AnalyticObserver().at_instants(view.frame).glints_px[0, :, 0]
+    own = np.stack([truth.glints.of_light(k)[0][view.row] for k in range(count)])
+    return np.nan_to_num(own - middle)
 
 
 def _limbus_now(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) -> tuple[Floats, str | None]:
@@ -390,10 +447,13 @@ def _glints(scene: RenderableScene, observations: Observations, view: EyeInWindo
     return out
 
 
-def _seen_glint(image: EyeImage, k: int, hidden_by: str | None) -> dict[str, Any]:
-    """Measure the visible part of the k-th glint, which may exist even if the lamp's centre has no mirror point."""
+def _seen_glint(image: EyeImage, k: int, hidden_by: str | None, shift_px: Floats) -> dict[str, Any]:
+    """Measure the visible part of the k-th glint, which may exist even if the lamp's centre has no mirror point.
+
+    `shift_px` (2,) leads from mid-exposure, when the visible part is known, to the time of the glint's row.
+    """
     table = image.rendered.glints
-    spot = table.xy_px[k]
+    spot = table.xy_px[k] + shift_px
     lit = bool(np.isfinite(spot).all())
     visible = lit and bool(table.visible[k]) and bool(in_window(image.window, spot))
     if visible:

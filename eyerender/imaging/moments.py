@@ -14,6 +14,7 @@ from ..eye.pose import Poses, rigid_motion
 from ..rig.imaging import Motion
 from ..scene.observation import EYES
 from .renderable import RenderableFrames
+from .shared import moving_part, share_lids
 
 if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob, SubFrames
@@ -89,18 +90,20 @@ def _in_sequence(
     rows = np.arange(middle.window[3]) + middle.window[1]
     edges, on = timing.segments(int(rows[0]), int(rows[-1]), lights)
     counts = [_steps_of(frames, row, middle, start + low, start + high) for low, high in pairwise(edges)]
-    whole = counts[0] if len(counts) == 1 else _steps_of(frames, row, middle, start + edges[0], start + edges[-1])
-    if whole == 1 and on.all():
+    moves = sum(counts) > len(counts) or _steps_of(frames, row, middle, start + edges[0], start + edges[-1]) > 1
+    if not moves and on.all():
         return ()
-    parts, labelled = [], _Labelled(timing.seen([start], rows[None], lights).time_s[0], start, edges, counts)
-    moves = sum(counts) > len(counts)
-    for k, count in enumerate(counts):
+    inner = [np.linspace(*pair, count + 1) for pair, count in zip(pairwise(edges), counts, strict=True)]
+    times = start + np.concatenate([(part[:-1] + part[1:]) / 2.0 for part in inner])
+    labelled = _Labelled(timing.seen([start], rows[None], lights).time_s[0], times, counts, moves=moves)
+    then = frames.at(np.full(len(times), row), times)
+    shared = share_lids([job_of(then, k) for k in range(len(times))])
+    moving, parts = moving_part(shared), []
+    for k in range(len(counts)):
         if not on[k].any() and not _is_lit_otherwise(middle):
             continue
-        inner = np.linspace(edges[k], edges[k + 1], count + 1)
-        jobs = []
-        for n, time_s in enumerate((inner[:-1] + inner[1:]) / 2.0):
-            job = job_of(frames.at([row], np.array([start + time_s])), 0)
+        jobs: list[RenderJob] = []
+        for n, job in enumerate(shared[labelled.first[k] : labelled.first[k + 1]]):
             dimmed = tuple(
                 lamp if lit else replace(lamp, intensity_mw_sr=0.0) for lamp, lit in zip(job.lights, on[k], strict=True)
             )
@@ -108,29 +111,31 @@ def _in_sequence(
             if moves:
                 seed = int(np.random.SeedSequence([middle.seed, k, n]).generate_state(1, np.uint64)[0])
             jobs.append(replace(job, lights=dimmed, seed=seed, labels=False))
-        shares = timing.shares(inner, rows)
+        shares = timing.shares(inner[k], rows)
         if timing.is_rolling or timing.field_delay_s:
             parts += [
-                SubFrames(jobs=(job,), rows=share, labelled=labelled.rows(k, n) if timing.is_rolling else None)
+                SubFrames(
+                    jobs=(job,), rows=share, moving=moving, labelled=labelled.rows(k, n) if timing.is_rolling else None
+                )
                 for n, (job, share) in enumerate(zip(jobs, shares, strict=True))
                 if share.any()
             ]
         else:
-            whole = shares.sum(axis=0)
-            parts.append(SubFrames(jobs=tuple(jobs), rows=None if (whole > 1.0 - 1e-12).all() else whole))
+            share = shares.sum(axis=0)
+            parts.append(
+                SubFrames(jobs=tuple(jobs), rows=None if (share > 1.0 - 1e-12).all() else share, moving=moving)
+            )
     return tuple(parts) or (SubFrames(jobs=(replace(middle, labels=False),), rows=np.zeros(len(rows))),)
 
 
 class _Labelled:
     """Which rows of a rolling shutter have the raster labels of which moment: the one nearest to the row's light."""
 
-    def __init__(self, lit_s: Floats, start_s: float, edges_s: Floats, counts: list[int]) -> None:
-        inner = [np.linspace(low, high, n + 1) for (low, high), n in zip(pairwise(edges_s), counts, strict=True)]
-        middles = np.concatenate([(edge[:-1] + edge[1:]) / 2.0 for edge in inner])
+    def __init__(self, lit_s: Floats, times_s: Floats, counts: list[int], *, moves: bool) -> None:
         self.first = np.cumsum([0, *counts])
-        when = np.where(np.isfinite(lit_s), lit_s - start_s, 0.0)
-        self.nearest = np.abs(when[None] - middles[:, None]).argmin(axis=0)
-        self.moves = sum(counts) > len(counts)
+        when = np.where(np.isfinite(lit_s), lit_s, times_s[0])
+        self.nearest = np.abs(when[None] - times_s[:, None]).argmin(axis=0)
+        self.moves = moves
 
     def rows(self, segment: int, number: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None:
         """Return the rows of one moment of a segment; None if the picture does not move, or it has none."""

@@ -7,9 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from ..base.arrays import Floats
-from .surfaces_measured import GridSurface, Measured, ZernikeSurface
+from .surfaces_measured import GridSurface, Measured, ZernikeSurface, order_of, terms
 from .topography import outer_biconic, outer_height, spline_coefficients
-from .zernike import order_of, terms
 
 WINDOW = (0.75, 1.15)
 """Shares of the zone's radius between which the biconic takes over.
@@ -24,22 +23,14 @@ _ANY = np.array([8.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 @lru_cache(maxsize=4096)
 def zernike_surface(
-    coefficients_mm: tuple[float, ...],
-    radius_mm: float,
+    coefficients_mm: tuple[float, ...],  # c_0, c_1, ... in the order of OSA/ANSI, depths.
+    radius_mm: float,  # radius of the disc on which the terms are orthonormal
     *,
-    base_radius_mm: float | None = None,
-    base_conic_constant: float = 0.0,
-    zone_radius_mm: float | None = None,
+    base_radius_mm: float | None = None,  # radius of curvature of the conic below the terms; None: a plane
+    base_conic_constant: float = 0.0,  # Q of that conic
+    zone_radius_mm: float | None = None,  # radius of the measured zone; None: that of the disc
 ) -> ZernikeSurface:
-    """Build the surface of Zernike terms with its apex at the origin; the biconic is fitted once per shape.
-
-    Args:
-        coefficients_mm: c_0, c_1, ... in the order of OSA/ANSI, depths.
-        radius_mm: radius of the disc on which the terms are orthonormal.
-        base_radius_mm: radius of curvature of the conic below the terms; None: a plane.
-        base_conic_constant: Q of that conic.
-        zone_radius_mm: radius of the measured zone; None: that of the disc.
-    """
+    """Build the surface of Zernike terms with its apex at the origin; the biconic is fitted once per shape."""
     coefficients = np.zeros(terms(max(order_of(len(coefficients_mm)), 1)))
     coefficients[: len(coefficients_mm)] = coefficients_mm
     base = np.array([0.0 if base_radius_mm is None else 1.0 / base_radius_mm, base_conic_constant])

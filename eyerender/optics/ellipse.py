@@ -24,14 +24,9 @@ from ..base.errors import InputError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipse:
-    """One ellipse in pixels.
+    """One ellipse: centre (2,) px, semi-axes (2,) px, a >= b > 0, and the angle of a from +x toward +y, [0, pi).
 
-    The constructor accepts equivalent forms (b > a, any angle) and converts them to the one below.
-
-    Attributes:
-        centre_px: (2,) px.
-        semi_axes_px: (2,) px, a >= b > 0.
-        angle_rad: angle of a from +x toward +y, [0, pi).
+    The constructor accepts equivalent forms (b > a, any angle) and converts them.
 
     Raises:
         InputError: an axis is not positive, or a number is not finite.
@@ -118,16 +113,10 @@ class Ellipse:
 
 
 class EllipseFit(NamedTuple):
-    """A batch of fitted ellipses.
+    """A batch (...) of fitted ellipses; `residual_px` is the root mean square Sampson distance.
 
     If no ellipse fits (collinear points, values that are not finite), the residual is infinite and the parameters are
     NaN. `ok` marks the valid ones.
-
-    Attributes:
-        centre_px: (..., 2) px.
-        semi_axes_px: (..., 2) px.
-        angle_rad: (...) rad.
-        residual_px: (...) root mean square Sampson distance, px.
     """
 
     centre_px: Floats
@@ -179,17 +168,7 @@ def fit_ellipse_direct(points: ArrayLike) -> EllipseFit:
 
 
 def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike, count: int) -> Floats:
-    """Compute boundary points p(t_j) at t_j = 2 pi j / count.
-
-    Args:
-        centre_px: (..., 2) px.
-        semi_axes_px: (..., 2) px.
-        angle_rad: (...) rad.
-        count: number of points.
-
-    Returns:
-        (..., count, 2) px.
-    """
+    """Compute boundary points p(t_j) at t_j = 2 pi j / count of ellipses (...): (..., count, 2) px."""
     centre = np.asarray(centre_px, dtype=np.float64)
     axes = np.asarray(semi_axes_px, dtype=np.float64)
     angle = np.asarray(angle_rad, dtype=np.float64)[..., None]
@@ -202,17 +181,9 @@ def points_on_ellipse(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: 
 
 
 def conic_from_parameters(centre_px: ArrayLike, semi_axes_px: ArrayLike, angle_rad: ArrayLike) -> Floats:
-    """Convert ellipses to conics (A, B, C, D, E, F) with F(p) = |p'|^2 - 1, p' in units of the semi-axes.
+    """Convert ellipses (...) to conics (..., 6): F(p) = |p'|^2 - 1, p' in units of the semi-axes.
 
     F is -1 at the centre, 0 on the boundary and positive outside.
-
-    Args:
-        centre_px: (..., 2) px.
-        semi_axes_px: (..., 2) px.
-        angle_rad: (...) rad.
-
-    Returns:
-        (..., 6) coefficients.
     """
     centre = np.asarray(centre_px, dtype=np.float64)
     axes = np.asarray(semi_axes_px, dtype=np.float64)

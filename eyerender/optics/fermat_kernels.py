@@ -45,7 +45,8 @@ One rounding of the direction moves a ray by 1e-7 mm at 1e9 mm. What counts is t
 is 1e-12 rad for every end that is farther, up to infinity.
 """
 FOUND, OUTSIDE, LOST = int(Status.OK), int(Status.OUTSIDE_LIMBUS), int(Status.NOT_CONVERGED)
-"""Statuses of a ray: found, beyond the rim of the outermost surface, and not found (yet)."""
+AT_EDGE = int(Status.AT_LENS_EDGE)
+"""Statuses of a ray: found, beyond the rim of the outermost surface, not found (yet), and outside an outline."""
 LANES = 32
 _FIELDS = (
     # point, slopes and second derivatives of its surface
@@ -386,6 +387,35 @@ def axis_distance(sheet: Sheet, x: float, y: float, z: float) -> float:
     return float(np.sqrt(max(x * x + y * y + z * z - along * along, 0.0)))
 
 
+@inlined
+def is_inside(outline: Floats, node: Node, lane: int) -> bool:
+    """Return whether a traced point lies inside an elliptical outline: its centre, and its axes over their lengths."""
+    x, y, z = node.p_x[lane] - outline[0], node.p_y[lane] - outline[1], node.p_z[lane] - outline[2]
+    u = x * outline[3] + y * outline[4] + z * outline[5]
+    v = x * outline[6] + y * outline[7] + z * outline[8]
+    return bool(u * u + v * v <= 1.0)
+
+
+@merged
+def check_outlines(outlines: Floats, batch: Batch, nodes: Nodes, state: Statuses) -> None:
+    """Mark rays that pass a surface outside its outline."""
+    for lane in range(min(LANES, batch.total - batch.first)):
+        i, k = row_of(batch, lane)
+        for j in range(outlines.shape[1]):
+            if state[i, k] == FOUND and not is_inside(outlines[min(i, len(outlines) - 1), j], nodes[j + 1], lane):
+                state[i, k] = AT_EDGE
+
+
+@merged
+def store_rimmed(before: Node, node: Node, batch: Batch, met: Floats, arriving: Floats) -> None:
+    """Write where rays meet the rimmed surface, and the directions in which they arrive."""
+    for lane in range(min(LANES, batch.total - batch.first)):
+        i, k = row_of(batch, lane)
+        met[0, i, k], met[1, i, k], met[2, i, k] = node.p_x[lane], node.p_y[lane], node.p_z[lane]
+        arriving[0, i, k], arriving[1, i, k] = before.w_x[lane], before.w_y[lane]
+        arriving[2, i, k] = before.w_z[lane]
+
+
 @merged
 def store(
     sheets: Sheets, rims: Floats, reflects: bool, rimmed: int, batch: Batch, nodes: Nodes,
@@ -457,9 +487,19 @@ def mirror_start(
     straight_start(surfaces, rimmed, batch, nodes)
 
 
+@merged
+def given_start(surfaces: Surfaces, rimmed: int, batch: Batch, nodes: Nodes, guesses: Floats) -> None:
+    """Start from given points of the rimmed surface."""
+    w = nodes[rimmed]
+    for lane in range(LANES):
+        i, k = row_of(batch, lane)
+        w.x[lane], w.y[lane], w.z[lane] = guesses[0, i, k], guesses[1, i, k], guesses[2, i, k]
+    straight_start(surfaces, rimmed, batch, nodes)
+
+
 @compiled(
-    "i8[::1], SHEET[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], b1, i8, f8[:,:,::1], "
-    "f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i1[:,::1]",
+    "i8[::1], SHEET[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], b1, i8, b1, "
+    "f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i1[:,::1]",
     SHEET=SHEET,
 )
 def connect_all(
@@ -470,12 +510,16 @@ def connect_all(
     rims: Floats,
     viewpoint: Floats,
     target: Floats,
+    outlines: Floats,
     reflects: bool,
     rimmed: int,
+    given: bool,
     guesses: Floats,
     exits: Floats,
     ways: Floats,
     ends: Floats,
+    met: Floats,
+    arriving: Floats,
     residuals: Floats,
     state: Statuses,
 ) -> None:
@@ -491,12 +535,17 @@ def connect_all(
         rims: (1 or n,) radius at which the rimmed surface ends.
         viewpoint: (3, 1 or n, 1 or m) mm.
         target: (3, 1 or n, 1 or m) mm.
+        outlines: (1 or n, s, 9) elliptical outlines of the surfaces: centre, and both axes over their lengths, 0 for
+            none; or (1, 0, 9).
         reflects: whether the rimmed surface reflects the rays; those behind it in the list are crossed on the way out.
         rimmed: number of the surface with a rim, from 1: the outermost one of the eye.
-        guesses: (3, n, m) first guesses of mirror points, written if it reflects.
+        given: whether `guesses` are given.
+        guesses: (3, n, m) first guesses of mirror points, written if it reflects and they are not given.
         exits: (3, n, m) points on the outermost surface, written.
         ways: (3, n, m) directions to them from the viewpoint, written.
         ends: (3, n, m) directions in the last medium, written.
+        met: (3, n, m) points on the rimmed surface, written; or empty.
+        arriving: (3, n, m) directions before it, written; or empty.
         residuals: (n, m) misses of the traced rays, mm, written.
         state: (n, m), initially LOST, written.
     """
@@ -504,10 +553,15 @@ def connect_all(
     for first in range(0, state.size, LANES):
         batch = Batch(first, state.size, max(state.shape[1], 1))
         load(surfaces, ladder, viewpoint, target, batch, nodes)
-        if reflects:
+        if given:
+            given_start(surfaces, rimmed, batch, nodes, guesses)
+        elif reflects:
             mirror_start(surfaces, rims, rimmed, batch, nodes, guesses, state)
         else:
             paraxial_start(surfaces, rimmed, batch, nodes)
-        solve(surfaces, STEPS if rimmed == 1 else 2 * STEPS, batch, nodes)
+        solve(surfaces, 2 * STEPS if given or rimmed > 1 else STEPS, batch, nodes)
         trace(surfaces, reflects, rimmed, batch, nodes)
         store(sheets, rims, reflects, rimmed, batch, nodes, exits, ways, ends, residuals, state)
+        check_outlines(outlines, batch, nodes, state)
+        if met.size:
+            store_rimmed(nodes[rimmed - 1], nodes[rimmed], batch, met, arriving)

@@ -34,23 +34,16 @@ def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ops:
-    """Operations of one array library.
+    """Operations of one array library."""
 
-    Attributes:
-        sqrt: square root.
-        root: the square root in the height of a sheet, `sheet_height`. It decides what follows beyond the sheet's end,
-            where its argument is negative: NaN, or a continuation with which Newton's method can come back.
-        maximum: larger one of two numbers.
-        copysign: the first number with the sign of the second.
-        select: select(mask, a, b) is a where the mask holds, else b.
-        compile: decorator of every formula, for a compiler; default: none.
-    """
-
-    sqrt: Callable[..., Any]
+    sqrt: Callable[..., Any]  # square root
+    # the square root in the height of a sheet, `sheet_height`. It decides what follows beyond the sheet's end, where
+    # its argument is negative: NaN, or a continuation with which Newton's method can come back.
     root: Callable[..., Any]
-    maximum: Callable[..., Any]
-    copysign: Callable[..., Any]
-    select: Callable[..., Any]
+    maximum: Callable[..., Any]  # larger one of two numbers
+    copysign: Callable[..., Any]  # the first number with the sign of the second
+    select: Callable[..., Any]  # select(mask, a, b) is a where the mask holds, else b
+    # decorator of every formula, for a compiler; default: none
     compile: Callable[[Callable[..., Any]], Callable[..., Any]] = _unchanged
 
 
@@ -66,25 +59,15 @@ class Jet(NamedTuple):
 
 
 class Bend(NamedTuple):
-    """A ray behind a surface: w = eta d + f N.
+    """A ray behind a surface: w = eta d + f N."""
 
-    Attributes:
-        way: unit direction w.
-        cosine: c = -d.N before the surface.
-        behind: the same behind it, with the sign of c; -c for a mirror.
-        eta: index before over index behind; 1 for a mirror.
-        factor: f.
-        slope: df/dc, for `bend_differential`.
-        passes: whether light passes; at total reflection w is the grazing direction.
-    """
-
-    way: Vector
-    cosine: Number
-    behind: Number
-    eta: Number
-    factor: Number
-    slope: Number
-    passes: Any
+    way: Vector  # unit direction w
+    cosine: Number  # c = -d.N before the surface
+    behind: Number  # the same behind it, with the sign of c; -c for a mirror
+    eta: Number  # index before over index behind; 1 for a mirror
+    factor: Number  # f
+    slope: Number  # df/dc, for `bend_differential`
+    passes: Any  # whether light passes; at total reflection w is the grazing direction
 
 
 class Formulas(NamedTuple):
@@ -157,11 +140,7 @@ def refraction(ops: Ops) -> Callable[..., Bend]:
         square = 1.0 - eta * eta * (1.0 - cosine * cosine)
         behind = copysign(sqrt(maximum(square, least)), cosine)
         factor = eta * cosine - behind
-        w = (
-            eta * way[0] + factor * normal[0],
-            eta * way[1] + factor * normal[1],
-            eta * way[2] + factor * normal[2],
-        )
+        w = (eta * way[0] + factor * normal[0], eta * way[1] + factor * normal[1], eta * way[2] + factor * normal[2])
         return Bend(w, cosine, behind, eta, factor, eta - eta * eta * cosine / behind, square > 0.0)
 
     return ops.compile(refract)
@@ -203,17 +182,10 @@ def differential(ops: Ops) -> Callable[..., Vector]:
     def bend_differential(
         bend: Bend, way: Vector, normal: Vector, inverse: Number, curve: Vector, turn: Vector
     ) -> Vector:
-        """Bend the differential dd of a direction: dw = eta dd + f dN + N df/dc dc (Igehy 1999, eq. 15-19).
+        """Bend the differential dd (`turn`) of a direction d: dw = eta dd + f dN + N df/dc dc (Igehy 1999, eq. 15-19).
 
-        dN = (H dy - N (N.H dy)) / |g| is the tilt of the normal g / |g|, and dc = -(dd.N + d.dN).
-
-        Args:
-            bend: `refract` or `reflect` of the ray.
-            way: its direction d before.
-            normal: N.
-            inverse: 1 / |g|.
-            curve: H dy, the derivative of g along the move dy of the point on the surface (see `slide`).
-            turn: dd.
+        dN = (H dy - N (N.H dy)) / |g| is the tilt of the normal g / |g|, and dc = -(dd.N + d.dN). `inverse` is 1 / |g|,
+        and `curve` is H dy, the derivative of g along the move dy of the point on the surface (see `slide`).
         """
         along = inner(normal, curve)
         x = (curve[0] - along * normal[0]) * inverse
@@ -281,10 +253,7 @@ def sheet(ops: Ops) -> Callable[..., Jet]:
     def sheet_height(numerator: Jet, linear: Vector, square: Jet) -> Jet:
         """Compute x = -N / (l + u), u = sqrt(R), by differentiating x (l + u) = -N twice.
 
-        Args:
-            numerator: N and its derivatives.
-            linear: l, a polynomial of first degree, and its two slopes.
-            square: R and its derivatives.
+        N and R come with their derivatives; l, a polynomial of first degree, comes with its two slopes.
         """
         u = root(square.x)
         inverse = 1.0 / u
@@ -325,13 +294,8 @@ def quadric(ops: Ops) -> Callable[..., Jet]:
     def quadric_jet(place: Any, numerator: Any, linear: Any, square: Any, y: Number, z: Number) -> Jet:
         """Compute x = x_0 + l_y y + l_z z - N / (h + u), u = sqrt(R), with its derivatives.
 
-        Args:
-            place: x_0, l_y and l_z.
-            numerator: six coefficients of N, of 1, y, z, yy, yz and zz.
-            linear: three coefficients of h, of 1, y and z.
-            square: six coefficients of R, as of N.
-            y: coordinate.
-            z: coordinate.
+        `place` is x_0, l_y and l_z. N and R have six coefficients each, of 1, y, z, yy, yz and zz; h has those of 1, y
+        and z.
         """
         slant = (linear[0] + linear[1] * y + linear[2] * z, linear[1], linear[2])
         x = height(polynomial(numerator, y, z), slant, polynomial(square, y, z))
@@ -348,10 +312,7 @@ def biconic(ops: Ops) -> Callable[..., Jet]:
     def biconic_jet(constants: tuple[Number, ...], y: Number, z: Number) -> Jet:
         """Compute h = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - k_y y^2 - k_z z^2)) with its derivatives.
 
-        Args:
-            constants: (c_y, c_z, k_y, k_z), c = 1/R and k = (1 + Q) c^2 in the meridians of y and z.
-            y: local coordinate.
-            z: local coordinate.
+        `constants` are (c_y, c_z, k_y, k_z), c = 1/R and k = (1 + Q) c^2 in the meridians of y and z.
         """
         cy, cz, ky, kz = constants
         numerator = Jet(cy * y * y + cz * z * z, 2.0 * cy * y, 2.0 * cz * z, 2.0 * cy, 0.0, 2.0 * cz)
@@ -384,15 +345,8 @@ def blending(ops: Ops) -> Callable[..., Jet]:
     def blend_jet(inner: Jet, outer: Jet, y: Number, z: Number, share: Number, width: Number) -> Jet:
         """Blend h = B + w (M - B), w = 1 - s^3 (10 - 15 s + 6 s^2), of M (`inner`) and B (`outer`).
 
-        w has continuous second derivatives, so the curvature is continuous.
-
-        Args:
-            inner: M.
-            outer: B.
-            y: coordinate from the middle of the disc.
-            z: coordinate from the middle of the disc.
-            share: s = (y^2 + z^2 - q_i) / width, from 0 to 1.
-            width: q_o - q_i, the difference of the squared radii where the transition ends and begins.
+        w has continuous second derivatives, so the curvature is continuous. y and z count from the middle of the disc;
+        `share` is s = (y^2 + z^2 - q_i) / width, 0 to 1, and `width` is q_o - q_i, the difference of the squared radii.
         """
         rest = 1.0 - share
         w = rest * rest * rest * (1.0 + share * (3.0 + 6.0 * share))
@@ -416,13 +370,9 @@ def zernike(ops: Ops) -> Callable[..., Jet]:
     """Make the height of a Zernike expansion."""
 
     def zernike_jet(table: Any, order: int, p: Number, q: Number) -> Jet:
-        """Compute sum_ij t_ij T_i(p) T_j(q) over i + j <= order, for the height and each derivative (see `zernike`).
+        """Compute sum_ij t_ij T_i(p) T_j(q) over i + j <= order, for the height and each derivative.
 
-        Args:
-            table: six rows of coefficients t_ij in the order of `zernike.pairs`.
-            order: radial order of the expansion.
-            p: coordinate over the radius of the disc.
-            q: coordinate over the radius of the disc.
+        `table` has six rows of coefficients t_ij in the order of `pairs`; p and q are over the radius of the disc.
         """
         x, hy, hz, hyy, hyz, hzz = 0.0 * p, 0.0 * p, 0.0 * p, 0.0 * p, 0.0 * p, 0.0 * p
         term = 0
@@ -481,11 +431,8 @@ def bicubic(ops: Ops) -> Callable[..., Jet]:
     def bicubic_jet(near: Any, along: Any, across: Any, density: Number) -> Jet:
         """Compute sum_ab m_ab f_a(s) f_b(t) and its derivatives, f the four functions of a basis.
 
-        Args:
-            near: four rows of four coefficients m_ab of the cell, a along y and b along z.
-            along: `cubic_splines` or `monomials` of the place s in the cell along y.
-            across: the same of t, along z.
-            density: cells per mm.
+        `near` are four rows of four coefficients m_ab of the cell, a along y and b along z; `along` and `across` are
+        `cubic_splines` or `monomials` of the places s and t in the cell; `density` is cells per mm.
         """
         x, hy, hz, hyy, hyz, hzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for a in range(4):

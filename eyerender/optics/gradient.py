@@ -43,40 +43,24 @@ _OUTSIDE = 1e-9
 
 
 class Passage(NamedTuple):
-    """Rays (m,) that have crossed the medium, where they meet the far surface.
+    """Rays (m,) that have crossed the medium, where they meet the far surface."""
 
-    Attributes:
-        hit: the intersection; its `distance` is 0.
-        way: unit direction on arrival.
-        optical_path_mm: the integral of n ds.
-        moves: differentials of the point on the surface, one for each given one.
-        turns: differentials of the direction, one for each given one.
-    """
-
-    hit: Hit
-    way: Xyz
-    optical_path_mm: Floats
-    moves: list[Xyz]
-    turns: list[Xyz]
+    hit: Hit  # the intersection; its `distance` is 0
+    way: Xyz  # unit direction on arrival
+    optical_path_mm: Floats  # the integral of n ds
+    moves: list[Xyz]  # differentials of the point on the surface, one for each given one
+    turns: list[Xyz]  # differentials of the direction, one for each given one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientMedium(ArrayValue):
-    """The medium between two quadrics; one, or a batch of n with a leading axis.
+    """The medium between two quadrics; one, or a batch of n with a leading axis."""
 
-    Attributes:
-        centre_mm: (..., 3) centre.
-        matrices: (..., 2, 3, 3) A of the front and the back.
-        vectors: (..., 2, 3) b of the front and the back.
-        core: (...,) n_core.
-        fall: (...,) n_core - n_edge.
-    """
-
-    centre_mm: Floats
-    matrices: Floats
-    vectors: Floats
-    core: Floats
-    fall: Floats
+    centre_mm: Floats  # (..., 3) centre
+    matrices: Floats  # (..., 2, 3, 3) A of the front and the back
+    vectors: Floats  # (..., 2, 3) b of the front and the back
+    core: Floats  # (...,) n_core
+    fall: Floats  # (...,) n_core - n_edge
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "matrices", "vectors", "core", "fall"):
@@ -105,27 +89,15 @@ class GradientMedium(ArrayValue):
 
     def cross(
         self,
-        surface: Surface,
-        inward: bool,
-        point: Xyz,
-        way: Xyz,
-        moves: Sequence[Xyz] = (),
-        turns: Sequence[Xyz] = (),
-        steps: int | None = None,
+        surface: Surface,  # the surface through which the rays leave
+        inward: bool,  # whether the rays go from the front to the back
+        point: Xyz,  # start points of the rays
+        way: Xyz,  # directions of the rays behind the first surface
+        moves: Sequence[Xyz] = (),  # differentials of `point` (along the surface) to propagate
+        turns: Sequence[Xyz] = (),  # differentials of `way` to propagate
+        steps: int | None = None,  # steps in each half; None: STEPS
     ) -> Passage:
-        """Trace rays from one surface of the medium to the other.
-
-        `hit.ok` is False if a ray leaves the medium through the surface where it entered.
-
-        Args:
-            surface: the surface through which the rays leave.
-            inward: whether the rays go from the front to the back.
-            point: start points of the rays.
-            way: directions of the rays behind the first surface.
-            moves: differentials of `point` (along the surface) to propagate.
-            turns: differentials of `way` to propagate.
-            steps: steps in each half; None: STEPS.
-        """
+        """Trace rays between the surfaces of the medium; `hit.ok` is False for one that leaves where it entered."""
         steps = STEPS if steps is None else steps
         place, speed = _stacked(point, way)
         ndim = place.ndim - 1

@@ -197,34 +197,23 @@ def bracket(kind: int, sheet: Sheet, table: Floats, p: Point, w: Point, sign: fl
     "i8[::1], SHEET[:,::1], f8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], b1, b1, f8[:,::1], b1[:,::1]", SHEET=SHEET
 )
 def crossings(
-    kinds: Ints,
-    sheets: Sheets,
-    table: Floats,
-    conics: Floats,
-    points: Floats,
-    ways: Floats,
-    inward: bool,
+    kinds: Ints,  # kind of the surface
+    sheets: Sheets,  # (1 or n, 1) the surface, or that of each eye
+    table: Floats,  # table of the surface
+    conics: Floats,  # (1 or n, 2) its `likeness`
+    points: Floats,  # (3, n, k) origins of the rays in its frame, mm
+    ways: Floats,  # (3, n, k) their unit directions
+    inward: bool,  # whether they go in or out
+    # whether the surface is convex towards +x, the rays start on the side from which they cross, and only crossings
+    # ahead matter
     convex: bool,
-    distance: Floats,
-    found: Bools,
+    distance: Floats,  # (n, k) how far the rays reach, mm; overwritten by the distances of the crossings
+    found: Bools,  # (n, k) whether the rays cross, written
 ) -> None:
     """Intersect rays with the first surface by Newton's method, from the crossing of the approximating conic.
 
     Rays for which the steps do not converge are searched by bisection around that crossing. The error of every crossing
     is checked.
-
-    Args:
-        kinds: kind of the surface.
-        sheets: (1 or n, 1) the surface, or that of each eye.
-        table: table of the surface.
-        conics: (1 or n, 2) its `likeness`.
-        points: (3, n, k) origins of the rays in its frame, mm.
-        ways: (3, n, k) their unit directions.
-        inward: whether they go in or out.
-        convex: whether the surface is convex towards +x, the rays start on the side from which they cross, and only
-            crossings ahead matter.
-        distance: (n, k) how far the rays reach, mm; overwritten by the distances of the crossings.
-        found: (n, k) whether the rays cross, written.
     """
     sign = 1.0 if inward else -1.0
     for i in range(distance.shape[0]):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..base.arrays import Floats, remembered
@@ -29,20 +31,33 @@ def graphs_of(*surfaces: Surface) -> Graphs | None:
     frame = next((surface for surface in surfaces if isinstance(surface, GraphSurface)), None)
     first = surfaces[0]
     origin, rotation = np.zeros_like(first.origin_mm), np.broadcast_to(np.eye(3), first.rotation.shape)
-    if frame is not None and not _turned_about_x(frame.rotation):
+    plain = frame is None or _turned_about_x(frame.rotation)
+    if frame is not None and not plain:
         origin, rotation = frame.origin_mm, frame.rotation
-    columns, kinds, table = [], [], [np.zeros(1)]
+    columns: list[Sheets] = []
+    kinds: list[int] = []
+    table = [np.zeros(1)]
     back = np.swapaxes(rotation, -1, -2)
-    for surface in surfaces:
-        turn = back @ surface.rotation
-        place = (back @ (surface.origin_mm - origin)[..., None])[..., 0]
+    for k, surface in enumerate(surfaces):
+        same = next((j for j in range(k) if surfaces[j] is surface), None)  # rays may pass a lens twice
+        if same is not None:
+            columns.append(columns[same])
+            kinds.append(kinds[same])
+            continue
+        turn, place = surface.rotation, surface.origin_mm
+        if not plain:
+            turn, place = back @ turn, (back @ (place - origin)[..., None])[..., 0]
         sheets = placed_sheets(place, turn)
         if isinstance(surface, Quadric):
-            # Measured from a point beside its origin, so that no digits cancel.
-            seen = surface.seen_from(origin + rotation[..., :, 0] * place[..., :1], rotation)
-            if not np.all(seen.rotation[..., 0, 0] > 0.5):
+            if not np.all(turn[..., 0, 0] > 0.5):
                 return None
-            _write_quadric(sheets, seen)
+            # Measured from a point beside its origin, so that no digits cancel.
+            if plain:
+                coefficients = surface.about(place * (1.0, 0.0, 0.0))
+            else:
+                beside = origin + rotation[..., :, 0] * place[..., :1]
+                coefficients = surface.seen_from(beside, rotation).coefficients
+            _write_quadric(sheets, coefficients)
             apex = place + turn[..., :, 0] * surface.sag(0.0, 0.0)[..., None]
             sheets["apex"] = apex[..., 1:]
             kinds.append(SMOOTH)
@@ -60,9 +75,9 @@ def _turned_about_x(rotation: Floats) -> bool:
     return bool(np.all(np.abs(rotation[..., 1:, 0]) <= _AXES)) and bool(np.all(rotation[..., 0, 0] > 0.0))
 
 
-def _write_quadric(sheets: Sheets, quadric: Quadric) -> None:
+def _write_quadric(sheets: Sheets, coefficients: Sequence[Floats | float]) -> None:
     """Write a quadric, A_xx x^2 + 2 h x + N = 0 with R = h^2 - A_xx N, into records (n,)."""
-    xx, yy, zz, xy, xz, yz, bx, by, bz, c = quadric.coefficients
+    xx, yy, zz, xy, xz, yz, bx, by, bz, c = coefficients
     numerator = np.broadcast_arrays(c, 2.0 * by, 2.0 * bz, yy, 2.0 * yz, zz)
     square = (bx * bx, 2.0 * bx * xy, 2.0 * bx * xz, xy * xy, 2.0 * xy * xz, xz * xz)
     for k, (n, h) in enumerate(zip(numerator, square, strict=True)):

@@ -26,13 +26,9 @@ class FresnelShares(NamedTuple):
 def fresnel(
     cosine_incidence: npt.ArrayLike, n_before: FloatLike, n_after: FloatLike, n_film: FloatLike | None = None
 ) -> FresnelShares:
-    """Compute the reflectances `formulas.fresnel`, or with a film `formulas.fresnel_film`; 1 at total reflection.
+    """Compute the reflectances `formulas.fresnel`, or `formulas.fresnel_film` with a film; 1 at total reflection.
 
-    Args:
-        cosine_incidence: cosine of the angle before the interface.
-        n_before: index before it.
-        n_after: index behind it.
-        n_film: index of a film on it; None for a bare interface.
+    The cosine is that of the angle before the interface.
     """
     c1 = np.abs(np.asarray(cosine_incidence, dtype=np.float64))
     eta = n_before / n_after

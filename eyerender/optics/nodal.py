@@ -17,12 +17,9 @@ _PARALLEL = 1e-13
 
 
 def parallel_rays(path: Sequence[Crossing], objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats] | None:
-    """Compute rays from objects in air that arrive at the last surface parallel to their direction at the start.
+    """Compute rays from objects (m, 3) in air that arrive at the last surface parallel to their direction at the start.
 
-    Args:
-        path: the surfaces.
-        objects_mm: (m, 3) objects.
-        guess_mm: point at which the rays are aimed first.
+    They are first aimed at `guess_mm`.
 
     Returns:
         Directions (m, 3) at the start and points (m, 3) on the last surface; None if an object has no such ray.

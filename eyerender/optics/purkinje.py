@@ -42,43 +42,28 @@ class PurkinjePoints(ArrayValue):
     """Points at which a surface inside the eye reflects light from a source to a viewpoint.
 
     Values are NaN if there is no such ray.
-
-    Attributes:
-        points_mm: (..., 3) mirror point on the reflecting surface.
-        exit_points_mm: (..., 3) where the ray meets the outermost surface on its way to the viewpoint.
-        directions: (..., 3) unit vectors from there to the viewpoint.
-        course_mm: (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point to
-            the point of entry.
-        residual_mm: (...,) miss distance of the ray.
-        status: (...,).
     """
 
-    points_mm: Floats
-    exit_points_mm: Floats
-    directions: Floats
+    points_mm: Floats  # (..., 3) mirror point on the reflecting surface
+    exit_points_mm: Floats  # (..., 3) where the ray meets the outermost surface on its way to the viewpoint
+    directions: Floats  # (..., 3) unit vectors from there to the viewpoint
+    # (2 k - 1, ..., 3) all points of the ray on k surfaces, from the exit point over the mirror point to the point of
+    # entry
     course_mm: Floats
-    residual_mm: Floats
-    status: Statuses
+    residual_mm: Floats  # (...,) miss distance of the ray
+    status: Statuses  # (...,)
 
 
 def purkinje_path(
-    surfaces: Sequence[Surface],
-    indices: Sequence[FloatLike],
-    rims_mm: Sequence[FloatLike],
-    passing: Sequence[bool],
+    surfaces: Sequence[Surface],  # outside in; the last one reflects
+    indices: Sequence[FloatLike],  # the index behind each surface
+    rims_mm: Sequence[FloatLike],  # the rim radius of each surface
+    passing: Sequence[bool],  # whether a ray that misses a surface continues (shells of a gradient lens)
+    # the medium in front of the innermost surface, if its index is not constant
     gradient: GradientMedium | None = None,
-    n_outside: float = 1.0,
+    n_outside: float = 1.0,  # index outside the eye
 ) -> tuple[Crossing, ...]:
-    """Return the crossings of a ray that the innermost of `surfaces` reflects.
-
-    Args:
-        surfaces: outside in; the last one reflects.
-        indices: the index behind each surface.
-        rims_mm: the rim radius of each surface.
-        passing: whether a ray that misses a surface continues (shells of a gradient lens).
-        gradient: the medium in front of the innermost surface, if its index is not constant.
-        n_outside: index outside the eye.
-    """
+    """Return the crossings of a ray that the innermost of `surfaces` reflects."""
 
     def crossing(k: int, n_after: FloatLike, inward: bool) -> Crossing:
         edge = Status.OUTSIDE_LIMBUS if k == 0 else Status.MISSED
@@ -111,29 +96,19 @@ def purkinje_path(
 
 
 def purkinje_points(
-    surfaces: Sequence[Surface],
-    indices: Sequence[FloatLike],
-    rims_mm: Sequence[FloatLike],
-    passing: Sequence[bool],
-    source_mm: npt.ArrayLike,
-    viewpoint_mm: npt.ArrayLike,
-    gradient: GradientMedium | None = None,
-    n_outside: float = 1.0,
+    surfaces: Sequence[Surface],  # as are the next three and `gradient`, see `purkinje_path`
+    indices: Sequence[FloatLike],  # the index behind each surface
+    rims_mm: Sequence[FloatLike],  # the rim radius of each surface
+    passing: Sequence[bool],  # whether a ray that misses a surface continues
+    source_mm: npt.ArrayLike,  # (..., 3) sources
+    viewpoint_mm: npt.ArrayLike,  # (..., 3) viewpoints; they broadcast against the sources
+    gradient: GradientMedium | None = None,  # the medium in front of the innermost surface
+    n_outside: float = 1.0,  # index outside the eye
 ) -> PurkinjePoints:
     """Solve for rays that the innermost of `surfaces` reflects, and that the outer ones refract in and out.
 
     The status is NO_MIRROR_POINT if the image, followed from the axis, ends before source and viewpoint reach their
     positions, or lies beyond the rim of the reflecting surface.
-
-    Args:
-        surfaces: outside in; the last one reflects.
-        indices: the index behind each surface.
-        rims_mm: the rim radius of each surface.
-        passing: see `purkinje_path`.
-        source_mm: (..., 3) sources.
-        viewpoint_mm: (..., 3) viewpoints; they broadcast against the sources.
-        gradient: see `purkinje_path`.
-        n_outside: index outside the eye.
     """
     path = purkinje_path(surfaces, indices, rims_mm, passing, gradient, n_outside)
     viewpoint, source = np.broadcast_arrays(

@@ -15,21 +15,13 @@ from .surfaces import Xyz
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Graphs:
-    """Surfaces over the (y, z) plane of a working frame, p_eye = rotation p + origin_mm.
+    """Surfaces over the (y, z) plane of a working frame, p_eye = rotation p + origin_mm."""
 
-    Attributes:
-        kinds: (s,) kinds of the surfaces.
-        sheets: (1 or n, s) records of the type `SHEET`, one row per eye of a batch.
-        table: coefficients of measured surfaces.
-        origin_mm: (3,) or (n, 3).
-        rotation: (3, 3) or (n, 3, 3).
-    """
-
-    kinds: Ints
-    sheets: Sheets
-    table: Floats
-    origin_mm: Floats
-    rotation: Floats
+    kinds: Ints  # (s,) kinds of the surfaces
+    sheets: Sheets  # (1 or n, s) records of the type `SHEET`, one row per eye of a batch
+    table: Floats  # coefficients of measured surfaces
+    origin_mm: Floats  # (3,) or (n, 3)
+    rotation: Floats  # (3, 3) or (n, 3, 3)
 
     @property
     def plain(self) -> bool:
@@ -85,12 +77,7 @@ class Graphs:
 
 
 def placed_sheets(place: Floats, turn: Floats) -> Sheets:
-    """Create records (n,) with place and axis of surfaces.
-
-    Args:
-        place: (3,) or (n, 3) origins of the surfaces in the working frame.
-        turn: (3, 3) or (n, 3, 3) rotations from the surfaces' frames to it.
-    """
+    """Create records (n,) with place (3,) or (n, 3) and rotation of surfaces in the working frame."""
     sheets = np.zeros(1 if place.ndim == 1 else len(place), dtype=SHEET)
     sheets["origin"], sheets["axis"], sheets["place"][:, 0] = place, turn[..., :, 0], place[..., 0]
     sheets["cosine"], sheets["sine"] = turn[..., 1, 1], turn[..., 2, 1]

@@ -15,12 +15,7 @@ SHELLS = 21
 
 
 class Layers(NamedTuple):
-    """Layers of a lens from outside in, (k,) each.
-
-    Attributes:
-        sizes: scale of each shell about the lens' centre.
-        index_shares: index inside each shell, as a share of the way from edge to core.
-    """
+    """Layers (k,) of a lens from outside in: the scale of each shell, and its index as a share from edge to core."""
 
     sizes: Floats
     index_shares: Floats
@@ -37,15 +32,9 @@ class Shells(NamedTuple):
 def lens_shells(
     front: Surface, back: Surface, centre_mm: Floats, indices: tuple[float, float, float], rim_mm: float, layers: Layers
 ) -> Shells:
-    """Compute the shells of the lens between two surfaces.
+    """Compute the shells of the lens between two surfaces, scaled about `centre_mm` (3,).
 
-    Args:
-        front: front surface of the lens.
-        back: back surface of the lens.
-        centre_mm: (3,) centre of the scaling.
-        indices: index of the edge, of the core, and behind the lens.
-        rim_mm: rim radius of the outermost shell.
-        layers: sizes and indices of the shells.
+    `indices` are those of the edge, of the core, and behind the lens; the outermost shell has the rim radius `rim_mm`.
     """
     edge, core, behind = indices
     size, inside = layers.sizes, edge + (core - edge) * layers.index_shares

@@ -37,47 +37,27 @@ _RETREATS = 12
 
 
 class Shot(NamedTuple):
-    """Rays shot from a source, one array per coordinate.
+    """Rays shot from a source, one array per coordinate."""
 
-    Attributes:
-        start: unit direction at the source.
-        first: the point on the first crossing.
-        last: the point on the last crossing.
-        turning: the point of the last reflection; the first point if there is none.
-        end: unit direction in the last medium.
-        along: distance (mm) from the last crossing to the point of closest approach to the target.
-        miss: vector from there to the target.
-        residual_mm: its length. For a target more than `FAR_MM` from the last surface it is measured at `FAR_MM`.
-        tubes: a_1 and a_2 of the ray tube (see the module).
-        determinant_mm2_sr: w . (a_1 x a_2), with its sign.
-        status: (...,).
-    """
-
-    start: Xyz
-    first: Xyz
-    last: Xyz
-    turning: Xyz
-    end: Xyz
-    along: Floats
-    miss: Xyz
-    residual_mm: Floats
-    tubes: tuple[Xyz, Xyz]
-    determinant_mm2_sr: Floats
-    status: Statuses
+    start: Xyz  # unit direction at the source
+    first: Xyz  # the point on the first crossing
+    last: Xyz  # the point on the last crossing
+    turning: Xyz  # the point of the last reflection; the first point if there is none
+    end: Xyz  # unit direction in the last medium
+    along: Floats  # distance (mm) from the last crossing to the point of closest approach to the target
+    miss: Xyz  # vector from there to the target
+    residual_mm: Floats  # its length. For a target more than `FAR_MM` from the last surface it is measured at `FAR_MM`.
+    tubes: tuple[Xyz, Xyz]  # a_1 and a_2 of the ray tube (see the module)
+    determinant_mm2_sr: Floats  # w . (a_1 x a_2), with its sign.
+    status: Statuses  # (...,)
 
 
 def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz) -> Shot:
-    """Solve for the rays from a source through a path to a target.
+    """Solve for the rays from sources through a path to targets, which broadcast; they are aimed at `aim` first.
 
     Undamped Newton steps are tried for all rays. The rays that do not converge go through a guarded search, in which
-    steps are halved until the miss shrinks. It starts from `aim`, then from points between it and the target.
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium at the source.
-        source: start points of the rays.
-        target: end points of the rays; source and target broadcast.
-        aim: points at which the rays are aimed first.
+    steps are halved until the miss shrinks. It starts from `aim`, then from points between it and the target. `n_start`
+    is the index at the source.
     """
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *target, *aim)))
     source, target = _spread(source, shape), _spread(target, shape)
@@ -98,17 +78,9 @@ def connect(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: X
 def correct(
     path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target: Xyz, aim: Xyz, steps: int = _FAST_STEPS
 ) -> Shot:
-    """Refine rays (m,) whose aim is already close, without the guarded search.
+    """Refine rays (m,) whose aim is already close by at most `steps` undamped Newton steps, as `connect` otherwise.
 
     The rays must meet the surfaces, but rims are not checked.
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium at the source.
-        source: (m,) start points of the rays.
-        target: (m,) end points of the rays.
-        aim: (m,) points at which they are aimed first.
-        steps: largest number of undamped Newton steps.
     """
     shot = _undamped(path, n_start, source, target, aim, steps)
     settled = _settled(shot, 100.0) & (shot.residual_mm <= RESIDUAL_LIMIT_MM)
@@ -127,28 +99,16 @@ def _undamped(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, target:
 
 
 class RayTube(NamedTuple):
-    """The tube of rays around a traced ray, arrays (...) and components.
+    """The tube of rays around a traced ray, arrays (...) and components."""
 
-    Attributes:
-        cross_section_mm2_sr: cross section at the target per solid angle at the source, |w . (a1 x a2)|. If source and
-            target lie in media of the same index, it is the same in both directions.
-        end: the ray's unit direction at the target.
-    """
-
+    # cross section at the target per solid angle at the source, |w . (a1 x a2)|. If source and target lie in media of
+    # the same index, it is the same in both directions.
     cross_section_mm2_sr: Floats
-    end: Xyz
+    end: Xyz  # the ray's unit direction at the target
 
 
 def ray_tube(path: Sequence[Crossing], n_start: FloatLike, source: Xyz, direction: Xyz, target: Xyz) -> RayTube:
-    """Compute the tube of rays around a known ray (see the module).
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium at the source.
-        source: start points of the rays.
-        direction: unit directions of the rays at the source.
-        target: points that the rays pass.
-    """
+    """Compute the tubes, at `target`, of rays with known unit directions at their sources (see the module)."""
     shape = np.broadcast_shapes(*(p.shape for p in (*source, *direction, *target)))
     shot = _shoot(path, n_start, _spread(source, shape), _spread(direction, shape), _spread(target, shape))
     return RayTube(np.abs(shot.determinant_mm2_sr), shot.end)

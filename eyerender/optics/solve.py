@@ -28,21 +28,13 @@ from .trace import Crossing, each, outward_path, trace
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ApparentPoints(ArrayValue):
-    """Points at which rays from object points to a viewpoint leave the outermost surface.
+    """Points at which rays from object points to a viewpoint leave the outermost surface."""
 
-    Attributes:
-        exit_points_mm: (..., 3) points on the outermost surface.
-        directions: (..., 3) unit vectors from the exit point to the viewpoint.
-        inner_directions: (..., 3) unit vectors from the object to the innermost surface.
-        residual_mm: (...,) miss distance of the traced ray.
-        status: (...,).
-    """
-
-    exit_points_mm: Floats
-    directions: Floats
-    inner_directions: Floats
-    residual_mm: Floats
-    status: Statuses
+    exit_points_mm: Floats  # (..., 3) points on the outermost surface
+    directions: Floats  # (..., 3) unit vectors from the exit point to the viewpoint
+    inner_directions: Floats  # (..., 3) unit vectors from the object to the innermost surface
+    residual_mm: Floats  # (...,) miss distance of the traced ray
+    status: Statuses  # (...,)
 
 
 class Rays(NamedTuple):
@@ -52,6 +44,8 @@ class Rays(NamedTuple):
         exit: the point on the outermost surface.
         way: unit direction from the viewpoint to it.
         end: unit direction in the last medium.
+        met: the point on the surface with a rim; NaN behind lenses where the ray was found by shooting.
+        arriving: unit direction before it; NaN like `met`.
         residual_mm: miss distance of the traced ray.
         status: (...,).
     """
@@ -59,29 +53,22 @@ class Rays(NamedTuple):
     exit: Xyz
     way: Xyz
     end: Xyz
+    met: Xyz
+    arriving: Xyz
     residual_mm: Floats
     status: Statuses
 
 
 def apparent_points(
-    surfaces: Sequence[Surface],
-    indices: Sequence[FloatLike],
-    object_points_mm: npt.ArrayLike,
-    viewpoint_mm: npt.ArrayLike,
+    surfaces: Sequence[Surface],  # outside in
+    indices: Sequence[FloatLike],  # the index behind each surface
+    object_points_mm: npt.ArrayLike,  # (..., 3) points behind the surfaces
+    viewpoint_mm: npt.ArrayLike,  # (..., 3) viewpoints; they broadcast against the object points
     *,
-    rim_mm: FloatLike = np.inf,
-    n_outside: float = 1.0,
+    rim_mm: FloatLike = np.inf,  # rim radius of the outermost surface (the limbus)
+    n_outside: float = 1.0,  # index outside the eye
 ) -> ApparentPoints:
-    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction).
-
-    Args:
-        surfaces: outside in.
-        indices: the index behind each surface.
-        object_points_mm: (..., 3) points behind the surfaces.
-        viewpoint_mm: (..., 3) viewpoints; they broadcast against the object points.
-        rim_mm: rim radius of the outermost surface (the limbus).
-        n_outside: index outside the eye.
-    """
+    """Compute where rays from object points to a viewpoint leave the outermost surface (refraction)."""
     rays = refracted_rays(
         surfaces, indices, components(object_points_mm), components(viewpoint_mm), rim_mm=rim_mm, n_outside=n_outside
     )
@@ -125,13 +112,8 @@ def mirroring(surface: Surface, rim_mm: FloatLike = np.inf) -> Crossing:
 def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: FloatLike = np.inf) -> Rays:
     """Compute where a surface reflects a source to a viewpoint outside: the first Purkinje image.
 
-    The residual is measured at 1000 mm if the source is farther away.
-
-    Args:
-        surface: the mirror.
-        source: components of the sources.
-        viewpoint: components of the viewpoints; they broadcast against the sources.
-        rim_mm: rim radius of the surface (the limbus).
+    Sources and viewpoints broadcast. The surface ends at the radius `rim_mm` (the limbus). The residual is measured at
+    1000 mm if the source is farther away.
     """
     return joined_rays((mirroring(surface, rim_mm),), 1.0, viewpoint, source)
 
@@ -143,6 +125,8 @@ def joined_rays(
     target: Xyz,
     rimmed: int = 0,
     *,
+    outlines: Floats | None = None,
+    starts: Xyz | None = None,
     thorough: bool = True,
 ) -> Rays:
     """Solve for the rays from viewpoints through a path to targets: refracted ones, or those that a surface reflects.
@@ -154,6 +138,10 @@ def joined_rays(
         target: components of the targets; both broadcast.
         rimmed: number of the crossing whose rim counts, the outermost one of the eye. Surfaces in front of it (lenses
             of spectacles) have none here.
+        outlines: (..., s, 3, 3) elliptical outlines of lenses: centre, and both axes over their lengths, 0 for surfaces
+            without one. Rays of the compiled solver that pass outside have the status AT_LENS_EDGE; others, whose
+            `met` is NaN, are not checked.
+        starts: points on the mirror from which rays are searched.
         thorough: whether to search for rays that the compiled solver does not find.
     """
     edge, graphs = path[rimmed], graphs_of(*(crossing.surface for crossing in path))
@@ -164,7 +152,7 @@ def joined_rays(
     else:
         media = (n_outside, *(crossing.n_after for crossing in path))
         ladder = np.stack(np.broadcast_arrays(*(np.atleast_1d(n) for n in media)), axis=-1)
-        rays, found, guess = _joined(graphs, ladder, edge.rim_mm, viewpoint, target, edge.reflects, rimmed)
+        rays, found, guess = _joined(graphs, ladder, edge, rimmed, viewpoint, target, outlines, starts)
         if thorough and not found.all():
             aim = guess if edge.reflects else target
             rays = _searched(path, n_outside, viewpoint, target, aim, rays, ~found)
@@ -172,27 +160,52 @@ def joined_rays(
 
 
 def _joined(
-    graphs: Graphs, ladder: Floats, rim_mm: FloatLike, viewpoint: Xyz, target: Xyz, reflects: bool, rimmed: int
+    graphs: Graphs,
+    ladder: Floats,
+    edge: Crossing,
+    rimmed: int,
+    viewpoint: Xyz,
+    target: Xyz,
+    outlines: Floats | None,
+    starts: Xyz | None,
 ) -> tuple[Rays, Bools, Xyz]:
     """Run the compiled solver; return its rays, which of them converged, and the first guesses of mirror points."""
-    shape = np.broadcast_shapes(*(p.shape for p in (*viewpoint, *target)))
+    ends = (viewpoint, target) if starts is None else (viewpoint, target, starts)
+    shape = np.broadcast_shapes(*(axis.shape for point in ends for axis in point))
     full = shape or (1,)
+    held = np.zeros((1, 0, 9)) if outlines is None else _in_frame(graphs, outlines)
     if not graphs.plain:
-        viewpoint, target = (turn_back(graphs.rotation, shift(p, graphs.origin_mm, -1.0)) for p in (viewpoint, target))
+        viewpoint, target, *rest = (turn_back(graphs.rotation, shift(p, graphs.origin_mm, -1.0)) for p in ends)
+        starts = rest[0] if rest else None
     state = np.full((full[0], int(np.prod(full[1:], dtype=np.intp))), LOST, dtype=np.int8)
-    found, residual = np.empty((4, 3, *state.shape)), np.empty(state.shape)
-    rims = np.array(np.atleast_1d(rim_mm), dtype=np.float64)
+    found, residual = np.empty((4 if outlines is None else 6, 3, *state.shape)), np.empty(state.shape)
+    if starts is not None:
+        found[0] = _rows(starts, full)
+    met, arriving = found[4:] if len(found) > 4 else np.empty((2, 3, 0, 0))
+    rims = np.array(np.atleast_1d(edge.rim_mm), dtype=np.float64)
     kinds, sheets, table = graphs.kinds, graphs.sheets, graphs.table
     connect_all(
-        kinds, sheets, table, ladder, rims, _rows(viewpoint, full), _rows(target, full), reflects, rimmed + 1,
-        found[0], found[1], found[2], found[3], residual, state,
+        kinds, sheets, table, ladder, rims, _rows(viewpoint, full), _rows(target, full), held, edge.reflects,
+        rimmed + 1, starts is not None, found[0], found[1], found[2], found[3], met, arriving, residual, state,
     )  # fmt: skip
-    guess, exits, way, end = ((x, y, z) for x, y, z in found.reshape(4, 3, *shape))
+    guess, exits, way, end, *more = ((x, y, z) for x, y, z in found.reshape(-1, 3, *shape))
     if not graphs.plain:
         exits, guess = (shift(turn(graphs.rotation, p), graphs.origin_mm, 1.0) for p in (exits, guess))
         way, end = turn(graphs.rotation, way), turn(graphs.rotation, end)
+        if more:
+            more = [shift(turn(graphs.rotation, more[0]), graphs.origin_mm, 1.0), turn(graphs.rotation, more[1])]
+    place, before = more or (exits, way)
     status = state.reshape(shape)
-    return Rays(exits, way, end, residual.reshape(shape), status), status != LOST, guess
+    return Rays(exits, way, end, place, before, residual.reshape(shape), status), status != LOST, guess
+
+
+def _in_frame(graphs: Graphs, outlines: Floats) -> Floats:
+    """Express outlines (..., s, 3, 3) in the frame of graphs, as rows (1 or n, s, 9) for the compiled solver."""
+    moved = np.array(outlines, dtype=np.float64)
+    if not graphs.plain:
+        moved[..., 0, :] -= graphs.origin_mm[..., None, :]
+        moved = moved @ graphs.rotation[..., None, :, :]
+    return np.ascontiguousarray(moved.reshape(-1, moved.shape[-3], 9))
 
 
 def _rows(point: Xyz, full: tuple[int, ...]) -> Floats:
@@ -277,7 +290,8 @@ def _searched(
 
 
 def _from_connection(found: Shot) -> Rays:
-    return Rays(found.first, found.start, found.end, found.residual_mm, found.status)
+    unknown = (np.full(found.status.shape, np.nan),) * 3
+    return Rays(found.first, found.start, found.end, unknown, unknown, found.residual_mm, found.status)
 
 
 def apex_of(surface: Surface) -> Floats:

@@ -26,14 +26,7 @@ Xyz = tuple[Floats, Floats, Floats]
 
 
 class Hit(NamedTuple):
-    """Intersections of rays with a surface.
-
-    Attributes:
-        distance: distance along the unit direction, mm.
-        point: the intersections.
-        gradient: half gradients there.
-        ok: whether the ray meets the surface.
-    """
+    """Intersections of rays with a surface: distance (mm), point, half gradient there, and whether there is one."""
 
     distance: Floats
     point: Xyz
@@ -67,11 +60,7 @@ class SymmetricMatrix(NamedTuple):
 class Surface(ABC):
     """One sheet of a surface in the eye frame.
 
-    The local frame is placed by p_eye = rotation p_local + origin_mm.
-
-    Attributes:
-        origin_mm: (..., 3) origin of the local frame.
-        rotation: (..., 3, 3) local to eye frame.
+    The local frame is placed by p_eye = rotation p_local + origin_mm, (..., 3, 3) and (..., 3).
     """
 
     __slots__ = ()
@@ -189,11 +178,7 @@ class Surface(ABC):
         return self.local_sag(np.asarray(y_mm, dtype=np.float64), np.asarray(z_mm, dtype=np.float64))
 
     def intersect(self, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Floats, Bools]:
-        """Compute the nearest crossing ahead.
-
-        Args:
-            origins_mm: (..., 3) origins.
-            directions: (..., 3) unit vectors.
+        """Compute the nearest crossing ahead of rays (..., 3) with unit directions.
 
         Returns:
             Distance (...,) in mm, infinite if the ray misses the surface, and whether there is a crossing (...,).

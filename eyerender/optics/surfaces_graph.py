@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from ..base.arrays import Floats, remembered
 from .formulas import Jet
-from .graph_kernels import Sheets
-from .sheets import Graphs, placed_sheets
+from .graph_kernels import SMOOTH, Sheets
+from .sheets import Graphs, placed_sheets, write_biconic
 from .surfaces import Hit, Surface, SymmetricMatrix, Xyz, fit, shift, turn, turn_back
 
 
@@ -111,12 +113,8 @@ def _own_graph(surface: GraphSurface) -> Graphs:
 def distances(surface: GraphSurface, points: Floats, ways: Floats, far: Floats, inward: bool) -> Floats:
     """Intersect rays with a single surface that is convex towards its local +x.
 
-    Args:
-        surface: the surface.
-        points: (n, 3) origins of the rays, which are on the side from which they cross.
-        ways: (n, 3) their unit directions.
-        far: (n,) distances (mm) from which on hits do not matter.
-        inward: whether the rays go in (d.g < 0) or out.
+    The rays (n, 3) start on the side from which they cross, with unit directions, in (d.g < 0) or out. Hits from the
+    distances `far` (n,), mm, on do not matter.
 
     Returns:
         Distances (n,) of the hits, infinite for none and perhaps for those beyond `far`.
@@ -126,3 +124,37 @@ def distances(surface: GraphSurface, points: Floats, ways: Floats, far: Floats, 
     x, y, z = start.T
     t, found = _own_graph(surface).crossings(conics, (x, y, z), tuple(way.T), inward, far)
     return np.where(found, t, np.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Biconic(GraphSurface):
+    """Biconic surface with its apex at the local origin.
+
+    x = -(c_y y^2 + c_z z^2) / (1 + sqrt(1 - (1 + Q_y) c_y^2 y^2 - (1 + Q_z) c_z^2 z^2)), c = 1/R
+    (Smith & Atchison 1997, "The eye and visual optical instruments", biconic surface.)
+    """
+
+    origin_mm: Floats  # (..., 3) apex in the eye frame
+    rotation: Floats  # (..., 3, 3) local to eye frame
+    radii_mm: Floats  # (..., 2) apex radii (R_y, R_z); positive ones open to -x, negative ones to +x
+    conic_constants: Floats  # (..., 2) conic constants (Q_y, Q_z)
+    _untilted: bool = field(init=False, repr=False)
+
+    kind: ClassVar[str] = "biconic"
+
+    def write(self, sheets: Sheets, table: list[Floats]) -> int:
+        """Write the shape into records that hold its place."""
+        write_biconic(sheets, self.radii_mm, self.conic_constants, sheets["cosine"], sheets["sine"])
+        return SMOOTH
+
+    def likeness(self) -> tuple[Floats, Floats]:
+        """Return curvature and 1 + Q of the conic with the mean curvature."""
+        return np.mean(1.0 / self.radii_mm, axis=-1), 1.0 + np.mean(self.conic_constants, axis=-1)
+
+    def _scaled_shape(self, factor: float) -> dict[str, Floats]:
+        """Scale the radii; conic constants stay."""
+        return {"radii_mm": factor * self.radii_mm}
+
+    def _mirrored_shape(self) -> dict[str, Floats]:
+        """Change nothing, because the sag is even in y."""
+        return {}

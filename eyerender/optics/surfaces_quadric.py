@@ -16,21 +16,13 @@ from .transforms import MIRROR, flip_y, read_only
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadric(Surface):
-    """F(p) = p^T A p + 2 b.p + c = 0 in the local frame, on the sheet where g_x = (A p + b)_x > 0.
+    """F(p) = p^T A p + 2 b.p + c = 0 in the local frame, on the sheet where g_x = (A p + b)_x > 0."""
 
-    Attributes:
-        origin_mm: (..., 3) origin of the local frame in the eye frame.
-        rotation: (..., 3, 3) local to eye frame.
-        matrix: (..., 3, 3) A, symmetric.
-        vector: (..., 3) b, mm.
-        constant: (...,) c, mm^2.
-    """
-
-    origin_mm: Floats
-    rotation: Floats
-    matrix: Floats
-    vector: Floats
-    constant: Floats
+    origin_mm: Floats  # (..., 3) origin of the local frame in the eye frame
+    rotation: Floats  # (..., 3, 3) local to eye frame
+    matrix: Floats  # (..., 3, 3) A, symmetric
+    vector: Floats  # (..., 3) b, mm
+    constant: Floats  # (...,) c, mm^2
     _eye: tuple[Floats | float, ...] = field(init=False, repr=False)
     _axial: bool = field(init=False, repr=False)
 
@@ -121,11 +113,7 @@ class Quadric(Surface):
     ) -> Quadric:
         """Create A x^2 + B y^2 + C z^2 + 2 D xy + 2 E xz + 2 F yz + 2 G x + 2 H y + 2 I z + K = 0, one of its sheets.
 
-        Args:
-            coefficients: A, B, C, D, E, F, G, H, I and K.
-            front: whether it is the sheet where dF/dx > 0 with these coefficients, instead of < 0.
-            origin_mm: place of the frame's origin.
-            rotation: rotation of the frame.
+        `coefficients` are A to K; `front` is the sheet where dF/dx > 0 with them, instead of < 0.
         """
         a, b, c, d, e, f, g, h, i, k = coefficients
         # The scale ties the size of rounding errors to distances, not to the unit of the coefficients.
@@ -148,6 +136,15 @@ class Quadric(Surface):
     def coefficients(self) -> tuple[Floats | float, ...]:
         """Return (A_xx, A_yy, A_zz, A_xy, A_xz, A_yz, b_x, b_y, b_z, c) in the eye frame; numbers or (n,) arrays."""
         return self._eye
+
+    def about(self, point_mm: Floats) -> tuple[Floats | float, ...]:
+        """Return the coefficients measured from a point (..., 3) of the eye frame, along the same axes."""
+        xx, yy, zz, xy, xz, yz, *_ = self._eye
+        x, y, z = np.moveaxis(self.origin_mm - point_mm, -1, 0)
+        u, v, w = np.moveaxis(np.einsum("...ij,...j->...i", self.rotation, self.vector), -1, 0)
+        pulled = (xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z)
+        constant = self.constant + sum(a * (p - 2.0 * b) for a, p, b in zip((x, y, z), pulled, (u, v, w), strict=True))
+        return (xx, yy, zz, xy, xz, yz, u - pulled[0], v - pulled[1], w - pulled[2], constant)
 
     def hit(self, origin: Xyz, direction: Xyz, inward: bool) -> Hit:
         """Solve (d.Ad) t^2 + 2 (d.g(o)) t + F(o) = 0 for the required sign of d.g, as F / (-b -+ sqrt(b^2 - aF))."""

@@ -22,26 +22,17 @@ _Nested = TypeVar("_Nested")
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Crossing:
-    """Crossing of a surface by a ray.
+    """Crossing of a surface by a ray."""
 
-    Attributes:
-        surface: the surface.
-        n_after: index behind the crossing, () or (n,), one per eye. Ignored for a reflection.
-        inward: whether the ray goes into the eye (towards -x of the surface's frame).
-        reflects: whether the ray is reflected instead of refracted.
-        rim_mm: distance from the axis at which the surface ends; infinite without an end.
-        beyond_rim: status of a ray that meets the surface outside its rim. None: such a ray continues straight on, like
-            one that misses the surface (the inner shells of a gradient lens are smaller than the pupil).
-        through: gradient medium in front of the crossing; None: the ray is straight.
-    """
-
-    surface: Surface
-    n_after: FloatLike
-    inward: bool = True
-    reflects: bool = False
-    rim_mm: FloatLike = np.inf
+    surface: Surface  # the surface
+    n_after: FloatLike  # index behind the crossing, () or (n,), one per eye. Ignored for a reflection.
+    inward: bool = True  # whether the ray goes into the eye (towards -x of the surface's frame)
+    reflects: bool = False  # whether the ray is reflected instead of refracted
+    rim_mm: FloatLike = np.inf  # distance from the axis at which the surface ends; infinite without an end
+    # status of a ray that meets the surface outside its rim. None: such a ray continues straight on, like one that
+    # misses the surface (the inner shells of a gradient lens are smaller than the pupil).
     beyond_rim: Status | None = Status.MISSED
-    through: GradientMedium | None = None
+    through: GradientMedium | None = None  # gradient medium in front of the crossing; None: the ray is straight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,18 +41,12 @@ class Traced(ArrayValue):
 
     The leading axis of the points is 0 for the start and k for the k-th crossing. Values after a failed crossing are
     undefined.
-
-    Attributes:
-        points_mm: (S + 1, ..., 3) points.
-        directions: (S + 1, ..., 3) unit directions on leaving each point.
-        optical_path_mm: (...,) optical path from the start to the last crossing.
-        status: (...,) of `Status`.
     """
 
-    points_mm: Floats
-    directions: Floats
-    optical_path_mm: Floats
-    status: Statuses
+    points_mm: Floats  # (S + 1, ..., 3) points
+    directions: Floats  # (S + 1, ..., 3) unit directions on leaving each point
+    optical_path_mm: Floats  # (...,) optical path from the start to the last crossing
+    status: Statuses  # (...,) of `Status`
 
 
 def inward_path(surfaces: Sequence[Surface], indices: Sequence[FloatLike]) -> tuple[Crossing, ...]:
@@ -80,14 +65,7 @@ def outward_path(
 
 
 def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLike, directions: npt.ArrayLike) -> Traced:
-    """Trace rays through a path.
-
-    Args:
-        path: the crossings, in order.
-        n_start: index of the medium in which the rays start.
-        origins_mm: (..., 3) origins.
-        directions: (..., 3) unit directions.
-    """
+    """Trace rays (..., 3) with unit directions through a path, from a medium of index `n_start`."""
     point, way = components(origins_mm), components(directions)
     shape = np.broadcast_shapes(point[0].shape, way[0].shape)
     points, ways = [point], [way]
@@ -113,29 +91,17 @@ def trace(path: Sequence[Crossing], n_start: FloatLike, origins_mm: npt.ArrayLik
 
 
 class Step(NamedTuple):
-    """Rays behind a crossing.
+    """Rays behind a crossing."""
 
-    Attributes:
-        point: point on the surface.
-        way: unit direction behind it.
-        n_after: index behind it.
-        optical_path_mm: optical path from the start of the ray.
-        met: whether the ray meets the surface.
-        within: whether it meets the surface within the rim.
-        blocked: whether the surface reflects the ray totally.
-        moves: differentials of the point on the surface, one for each given one.
-        turns: differentials of the direction.
-    """
-
-    point: Xyz
-    way: Xyz
-    n_after: FloatLike
-    optical_path_mm: Floats
-    met: Bools
-    within: Bools
-    blocked: Bools
-    moves: tuple[Xyz, ...]
-    turns: tuple[Xyz, ...]
+    point: Xyz  # point on the surface
+    way: Xyz  # unit direction behind it
+    n_after: FloatLike  # index behind it
+    optical_path_mm: Floats  # optical path from the start of the ray
+    met: Bools  # whether the ray meets the surface
+    within: Bools  # whether it meets the surface within the rim
+    blocked: Bools  # whether the surface reflects the ray totally
+    moves: tuple[Xyz, ...]  # differentials of the point on the surface, one for each given one
+    turns: tuple[Xyz, ...]  # differentials of the direction
 
 
 def cross(

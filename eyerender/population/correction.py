@@ -59,12 +59,7 @@ def prescription(power: Power, side: Side) -> dict[str, float]:
 
 
 def spectacles_of(person: Wearer, **keys: Any) -> dict[str, dict[str, Any]]:
-    """Return `spectacles` with the prescription of each eye and the same other keys (`SpectacleLens`).
-
-    Args:
-        person: the person.
-        keys: keys of the lenses, such as `vertex_mm` or `material`.
-    """
+    """Return `spectacles` with the prescription of each eye and the same other keys, such as `vertex_mm`."""
     v = 1e-3 * float(keys.get("vertex_mm", SpectacleLens.model_fields["vertex_mm"].default))
     out: dict[str, dict[str, Any]] = {}
     for side in EYES:
@@ -77,16 +72,17 @@ def contact_lens_of_person(person: Wearer, **keys: Any) -> dict[str, dict[str, A
     return {side: {"power_d": float(at_cornea(person, side)[0]), **keys} for side in EYES}
 
 
-def worn_by(person: Wearer, share: float) -> dict[str, Any]:
-    """Return the keys `spectacles` or `contact_lens` of a person, or none.
+def fitting(rng: np.random.Generator) -> dict[str, float]:
+    """Draw how a frame sits on a face: vertex distance, tilt and wrap of its lenses (chosen)."""
+    values = rng.normal([13.5, 8.0, 5.0], [0.8, 3.0, 2.5]).clip([12.0, 0.0, 0.0], [15.0, 15.0, 12.0])
+    return dict(zip(("vertex_mm", "pantoscopic_deg", "wrap_deg"), values.tolist(), strict=True))
 
-    Args:
-        person: the person.
-        share: share of those who need a correction that wear one.
-    """
+
+def worn_by(person: Wearer, share: float) -> dict[str, Any]:
+    """Return the keys `spectacles` or `contact_lens` of a person, or none; a `share` of those who need one wear one."""
     rng = np.random.default_rng(person.draw_seed("correction"))
     wears, contact = rng.random(2)
-    vertex, tilt, wrap = rng.normal([13.5, 8.0, 5.0], [0.8, 3.0, 2.5]).clip([12.0, 0.0, 0.0], [15.0, 15.0, 12.0])
+    fit = fitting(rng)
     coated, mirrored = rng.random(), rng.uniform(0.2, 0.4)
     errors = [prescription(at_cornea(person, side), side) for side in EYES]
     largest = max(abs(e["sphere_d"] + e["cylinder_d"] / 2.0) for e in errors)
@@ -95,7 +91,7 @@ def worn_by(person: Wearer, share: float) -> dict[str, Any]:
     likes_contact = contact < np.interp(person.number("age_years"), _CONTACT_AGES, _CONTACT_SHARES)
     if likes_contact and NEEDED_D <= largest < MOST_CONTACT_D:
         return {"contact_lens": contact_lens_of_person(person)}
-    lens: dict[str, Any] = {"vertex_mm": vertex, "pantoscopic_deg": tilt, "wrap_deg": wrap}
+    lens: dict[str, Any] = {**fit}
     lens["material"] = "CR-39" if largest < 3.0 else "1.60" if largest < 6.0 else "1.67"
     # Small lenses are thin at their thick edge or middle, which strong prescriptions are chosen for.
     lens["outline_mm"] = [25.0, 17.0] if largest < 4.0 else [22.0, 15.0]

@@ -40,33 +40,20 @@ _TAG = 0x9E0
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """Conditions on a population, sorted by how they are met.
+    """Conditions on a population, sorted by how they are met."""
 
-    Attributes:
-        exact: quantities with a regression -> value.
-        ranges: quantity -> low and high.
-        cut: latent column -> ends of the truncated latent number, and how the others follow it (width,).
-        fixed: (f,) required values of fixed latent numbers.
-        columns: (f,) columns of the fixed latent numbers.
-        carry: (f, w) change of all latent numbers per change of the fixed ones.
-        mean: (r, e) coefficients of the conditional mean of `exact`'s latent numbers, given those of `given`.
-        given: (r,) columns of the predictors and of fixed numbers.
-        fitted: (e,) columns of `exact`.
-        precision: (e, e) inverse V^-1.
-        follow: (e, w) change of all latent numbers per change of those of `exact`.
-    """
-
-    exact: Mapping[str, float]
-    ranges: Mapping[str, tuple[float, float]]
+    exact: Mapping[str, float]  # quantities with a regression -> value
+    ranges: Mapping[str, tuple[float, float]]  # quantity -> low and high
+    # latent column -> ends of the truncated latent number, and how the others follow it (width,)
     cut: Mapping[int, tuple[float, float, Floats]]
-    fixed: Floats
-    columns: list[int]
-    carry: Floats
-    mean: Floats
-    given: list[int]
-    fitted: list[int]
-    precision: Floats
-    follow: Floats
+    fixed: Floats  # (f,) required values of fixed latent numbers
+    columns: list[int]  # (f,) columns of the fixed latent numbers
+    carry: Floats  # (f, w) change of all latent numbers per change of the fixed ones
+    mean: Floats  # (r, e) coefficients of the conditional mean of `exact`'s latent numbers, given those of `given`
+    given: list[int]  # (r,) columns of the predictors and of fixed numbers
+    fitted: list[int]  # (e,) columns of `exact`
+    precision: Floats  # (e, e) inverse V^-1
+    follow: Floats  # (e, w) change of all latent numbers per change of those of `exact`
 
     @classmethod
     def of(cls, model: Model, where: Mapping[str, Condition]) -> Conditions:

@@ -56,16 +56,10 @@ def eye_file(
     entrance_mm: float,
     seed: int,
 ) -> EyeSpec:
-    """Return the eye file of a drawn eye.
+    """Return the eye file of a drawn eye, for an entrance pupil of `entrance_mm`.
 
-    Args:
-        name: name of the eye.
-        eye: numbers of the eye by their names in the table, including those from `refraction.solve`.
-        table: the table, for its constants.
-        age_years: age of the person.
-        accommodation_d: dioptres by which the lens is accommodated.
-        entrance_mm: diameter of the entrance pupil.
-        seed: selects the outline of the pupil.
+    `eye` are its numbers by their names in the table, including those from `refraction.solve`. The lens is accommodated
+    by `accommodation_d`; `seed` selects the outline of the pupil.
 
     Raises:
         InputError: the eye is physically impossible: surfaces cross, or the stop lies outside the chamber.
@@ -108,13 +102,7 @@ class _Table:
 
 @dataclass(frozen=True, slots=True)
 class _Accommodated:
-    """A drawn eye at one accommodation, with its stop at the table's reference diameter.
-
-    Attributes:
-        parts: its eye file.
-        front: surfaces of the cornea.
-        indices: the index behind each.
-    """
+    """A drawn eye at one accommodation, with its stop at the table's reference diameter: eye file and cornea."""
 
     parts: EyeParts
     front: tuple[Surface, ...]

@@ -11,17 +11,18 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.special import ndtri
 
 from ..base.arrays import Floats
 from ..base.errors import InputError
 from ..base.spec import EYES, KeyProblem, Number, Side, Spec
 from ..eye.fixation import far_sight_mm
-from ..eye.refraction import at_cornea_d
+from ..eye.landmarks import at_cornea_d
 from ..eye.spec import EyeSpec
-from ..region.anatomy import Region
+from ..region.anatomy import Region, Skin
 from ..region.look import Look
 from . import correction
-from .draw import Conditions, latent_numbers
+from .draw import Conditions, latent_numbers, uniform_numbers
 from .eyes import amplitude_d, eye_file
 from .marginals import Fixed
 from .model import Model, reference_of
@@ -29,6 +30,7 @@ from .pupil import watson_yellott_mm
 from .refraction import Biometry, Optics, solve
 from .table import ROOTS, Distribution, PopulationTable, QuantityRegression, default_table
 
+_SKIN_STREAM = 0x5C1A  # of random numbers; those of the latent numbers begin at 0x9E0 << 32
 SOLVED = tuple(field.name for field in fields(Optics))
 """Numbers of an eye that follow from its refraction."""
 
@@ -49,6 +51,12 @@ class PopulationSpec(Spec):
         default=0.0,
         description="share of those who need a correction that wear their own glasses or contact lenses in scenes; the "
         "people stay the same",
+    )
+
+    skin_history: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=1.0,
+        description="strength of what years and make-up do to skin: folds, unevenness, liner, shadow; with 0, people "
+        "are the same without these",
     )
 
     @model_validator(mode="after")
@@ -91,7 +99,8 @@ class PopulationSpec(Spec):
         """
         if n < 1:
             raise InputError(f"must be >= 1, not {n}", path="n")
-        return _values(self.model, latent_numbers(self.model, Conditions.of(self.model, self.where), seed, first, n))
+        found = _values(self.model, latent_numbers(self.model, Conditions.of(self.model, self.where), seed, first, n))
+        return found | skin_history(found["age_years"], found["male"], self.skin_history, seed, first)
 
     def person(self, subject: int, seed: int = 0) -> Person:
         """Return one subject."""
@@ -115,11 +124,7 @@ class Person(Spec):
         return cls(preset=preset, seed=seed, subject=subject, numbers=plain)
 
     def number(self, name: str, side: Side | None = None) -> float:
-        """Return a number of the person, or of one eye.
-
-        Raises:
-            InputError: there is no such number.
-        """
+        """Return a number of the person, or of one eye; InputError if there is no such number."""
         value = self.numbers.get(name)
         if value is None or isinstance(value, tuple) != (side is not None):
             raise InputError("missing, or not of the right kind", path=f"person.numbers.{name}")
@@ -306,6 +311,24 @@ def far_pupil_mm(
     spread = small + (large - small) * np.clip((mean - 2.5) / 4.0, 0.0, 1.0)
     far = mean + score * spread
     return np.clip(far, table.constant("smallest_pupil_mm"), table.constant("largest_pupil_mm"))
+
+
+def skin_history(age_years: Floats, male: Floats, strength: float, seed: int, first: int) -> dict[str, Floats]:
+    """Draw folds, unevenness and make-up (n,) of people from `first` on, with random numbers of their own.
+
+    All of it is set by eye. Folds deepen by half of their range from 25 to 65 years, and a third of the women wear
+    liner, a quarter shadow. Mottling and relief are lognormal about the defaults of the skin.
+    """
+    u = uniform_numbers(seed, _SKIN_STREAM, first, len(age_years), 5)
+    z, woman = ndtri(u), male < 0.5
+    skin = Skin()
+    return {
+        "skin.folds": strength * np.clip(0.3 + 0.0125 * (age_years - 25.0) + 0.15 * z[:, 0], 0.0, 1.0),
+        "skin.mottling": np.minimum(skin.mottling * np.exp(strength * (0.5 + 0.6 * z[:, 1])), 1.0),
+        "skin.relief_mm": np.minimum(skin.relief_mm * np.exp(strength * (0.5 + 0.4 * z[:, 2])), 0.12),
+        "skin.liner": strength * np.where(woman, np.clip(3.0 * u[:, 3] - 2.0, 0.0, 1.0), 0.0),
+        "skin.shadow": strength * np.where(woman, np.clip(4.0 * u[:, 4] - 3.0, 0.0, 1.0), 0.0),
+    }
 
 
 def _values(model: Model, latent: Floats) -> dict[str, Floats]:

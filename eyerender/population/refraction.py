@@ -44,24 +44,15 @@ Power = tuple[Floats, Floats, Floats]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Optics(ArrayValue):
-    """Optics that give eyes their refraction, (...,) each.
+    """Optics that give eyes their refraction, (...,) each."""
 
-    Attributes:
-        steep_mm: smaller principal radius of the front cornea.
-        flat_mm: larger principal radius.
-        flat_axis_deg: direction of the meridian of the larger radius, from nasal towards up.
-        posterior_steep_mm: smaller principal radius of the back cornea.
-        posterior_flat_mm: larger principal radius.
-        posterior_flat_axis_deg: direction of its meridian.
-        lens_c0: first coefficient of the lens' equivalent index; NaN if none within its limits gives the refraction.
-    """
-
-    steep_mm: Floats
-    flat_mm: Floats
-    flat_axis_deg: Floats
-    posterior_steep_mm: Floats
-    posterior_flat_mm: Floats
-    posterior_flat_axis_deg: Floats
+    steep_mm: Floats  # smaller principal radius of the front cornea
+    flat_mm: Floats  # larger principal radius
+    flat_axis_deg: Floats  # direction of the meridian of the larger radius, from nasal towards up
+    posterior_steep_mm: Floats  # smaller principal radius of the back cornea
+    posterior_flat_mm: Floats  # larger principal radius
+    posterior_flat_axis_deg: Floats  # direction of its meridian
+    # first coefficient of the lens' equivalent index; NaN if none within its limits gives the refraction
     lens_c0: Floats
 
 

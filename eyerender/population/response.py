@@ -29,25 +29,17 @@ _DIRECTIONS = 16
 
 
 def responding(
-    spec: EyeSpec,
+    spec: EyeSpec,  # the eye, which looks far away
     *,
-    age_years: float = REFERENCE_AGE,
-    accommodation_d: float = 0.0,
+    age_years: float = REFERENCE_AGE,  # age of the eye
+    accommodation_d: float = 0.0,  # demanded accommodation in dioptres, limited by age
+    # luminance of the visual field; None: the eye's own pupil holds for far vision
     luminance_cd_m2: float | None = None,
-    field_deg: float | None = None,
-    own_pupil: bool = False,
-    wavelength_nm: float = 850.0,
+    field_deg: float | None = None,  # diameter of the lit field; default: the table's
+    own_pupil: bool = False,  # whether the stop keeps its diameter
+    wavelength_nm: float = 850.0,  # wavelength of the traced rays
 ) -> EyeSpec:
     """Copy an eye file, adapted to some light and viewing distance.
-
-    Args:
-        spec: the eye, which looks far away.
-        age_years: age of the eye.
-        accommodation_d: demanded accommodation in dioptres, limited by age.
-        luminance_cd_m2: luminance of the visual field; None: the eye's own pupil holds for far vision.
-        field_deg: diameter of the lit field; default: the table's.
-        own_pupil: whether the stop keeps its diameter.
-        wavelength_nm: wavelength of the traced rays.
 
     Raises:
         InputError: the eye has no lens that could accommodate, or the result is physically impossible.

@@ -22,31 +22,18 @@ _REACH = 4.0  # range of histograms on either side of the mean, in standard devi
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """Mean and standard deviation of a drawn quantity, with standard errors, and the expected values.
+    """Mean and standard deviation of a drawn quantity, with standard errors, and the expected values."""
 
-    Attributes:
-        name: the quantity; for an eye's quantity, that of right eyes.
-        n: number of people.
-        mean: mean.
-        mean_error: its standard error.
-        sd: standard deviation.
-        sd_error: its standard error, from the kurtosis.
-        expected_mean: mean of the joint distribution; NaN for a quantity that follows from others.
-        expected_sd: its standard deviation.
-        edges: (b + 1,) edges of the histogram.
-        counts: (b,) people in it.
-    """
-
-    name: str
-    n: int
-    mean: float
-    mean_error: float
-    sd: float
-    sd_error: float
-    expected_mean: float
-    expected_sd: float
-    edges: Floats
-    counts: Ints
+    name: str  # the quantity; for an eye's quantity, that of right eyes
+    n: int  # number of people
+    mean: float  # mean
+    mean_error: float  # its standard error
+    sd: float  # standard deviation
+    sd_error: float  # its standard error, from the kurtosis
+    expected_mean: float  # mean of the joint distribution; NaN for a quantity that follows from others
+    expected_sd: float  # its standard deviation
+    edges: Floats  # (b + 1,) edges of the histogram
+    counts: Ints  # (b,) people in it
 
     @property
     def errors(self) -> tuple[float, float]:
@@ -87,19 +74,12 @@ class PopulationStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Refusals:
-    """Physically impossible eyes among n people.
+    """Physically impossible eyes among n people."""
 
-    Attributes:
-        n: number of people.
-        people: number of people with an impossible eye.
-        reasons: reason -> number of eyes.
-        shifts: quantity -> mean of the remaining people minus that of all, in standard deviations.
-    """
-
-    n: int
-    people: int
-    reasons: Mapping[str, int]
-    shifts: Mapping[str, float]
+    n: int  # number of people
+    people: int  # number of people with an impossible eye
+    reasons: Mapping[str, int]  # reason -> number of eyes
+    shifts: Mapping[str, float]  # quantity -> mean of the remaining people minus that of all, in standard deviations
 
 
 def pieces(population: PopulationSpec, n: int, seed: int) -> Iterator[dict[str, Floats]]:

@@ -124,11 +124,7 @@ class SyntEyes(ArrayValue):
 
     @classmethod
     def load(cls, path: str | Path) -> SyntEyes:
-        """Read the model's file.
-
-        Raises:
-            InputError: the file is of another kind.
-        """
+        """Read the model's file; InputError if the file is of another kind."""
         arrays = _arrays(path)
         for name, shape in _SHAPES.items():
             if name == "avg_ec_orig":

@@ -68,7 +68,7 @@ class Lid(Spec):
     thickness_mm: float = _number(2.6, 2.0, 3.4, "skin to globe above the margin (chosen)")
     film_mm: float = _number(0.02, 0.005, 0.05, "thickness of the tear film between inner lid edge and globe (chosen)")
     upper_follows: float = _number(0.9, 0.6, 1.0, "turn of the upper lid per turn of the eye (Becker)")
-    lower_follows: float = _number(0.35, 0.1, 0.6, "turn of the lower lid per turn of the eye (chosen)")
+    lower_follows: float = _number(0.5, 0.1, 0.6, "turn of the lower lid per turn of the eye (chosen)")
     crease_mm: float = _number(8.0, 5.0, 11.0, "crease above the margin of the closed lid (Cartwright; others 8 to 10)")
     show_mm: float = _number(2.6, 1.2, 5.0, "lid visible below the fold when open (Cartwright)")
     fold_mm: float = _number(1.0, 0.0, 1.9, "how far the fold stands above the crease (chosen)")
@@ -85,12 +85,14 @@ class Lashes(Spec):
     upper_count: Annotated[int, Field(ge=0, le=180)] = Field(
         default=120, description="number on the upper lid (textbooks)"
     )
-    lower_count: Annotated[int, Field(ge=0, le=110)] = Field(default=46, description="number on the lower lid (chosen)")
+    lower_count: Annotated[int, Field(ge=0, le=110)] = Field(
+        default=76, description="number on the lower lid (textbooks)"
+    )
     upper_length_mm: float = _number(8.5, 5.0, 12.0, "longest lash of the upper lid (textbooks)")
     lower_length_mm: float = _number(4.6, 3.0, 8.0, "longest lash of the lower lid (chosen)")
     diameter_mm: float = _number(0.085, 0.05, 0.12, "diameter at the root (chosen)")
     upper_curl_deg: float = _number(80.0, 20.0, 120.0, "turn of an upper lash from root to tip (chosen)")
-    lower_curl_deg: float = _number(100.0, 10.0, 140.0, "turn of a lower lash from root to tip (chosen)")
+    lower_curl_deg: float = _number(80.0, 10.0, 140.0, "turn of a lower lash from root to tip (chosen)")
     upper_droop_deg: float = _number(
         38.0, 22.0, 60.0, "angle of upper lashes at the root below the lid's normal (chosen)"
     )
@@ -139,6 +141,11 @@ class Skin(Spec):
     mottling: Share = Field(default=0.5, description="unevenness of the albedo (chosen)")
     relief_mm: float = _number(0.032, 0.0, 0.12, "depth of the skin's fine furrows (some tens of micrometres; chosen)")
     wrinkles: Share = Field(default=0.35, description="lines on and below the lids (chosen)")
+    folds: Share = Field(
+        default=0.0, description="number and depth of the folds of age: below and above the lids, crow's feet (chosen)"
+    )
+    shadow: Share = Field(default=0.0, description="make-up that darkens the upper lid up to its crease (chosen)")
+    liner: Share = Field(default=0.0, description="make-up that draws a dark line along the lashes (chosen)")
     pores: Share = Field(default=0.5, description="depth of the pores beyond the lids (chosen)")
     veins: Share = Field(
         default=0.35, description="strength of the veins that show through the thin skin of the lids (chosen)"
@@ -255,7 +262,7 @@ class Region(Spec):
         return cls.from_mapping({**_draw(cls, (seed,), spread), "seed": seed, "blink": blink})
 
 
-_NOT_DRAWN = ("head", "map", "mascara", "squint", "wide")
+_NOT_DRAWN = ("folds", "head", "liner", "map", "mascara", "shadow", "squint", "wide")
 
 
 def _draw(kind: type[Spec], key: tuple[int, ...], spread: float) -> dict[str, object]:

@@ -17,7 +17,7 @@ from ..base.arrays import ArrayValue, Floats, Ints, frozen
 from ..optics.vectors import crosses, dots, lengths
 from .contour import unit
 
-SEGMENTS = 6
+SEGMENTS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,14 +5,15 @@ A lash starts in the lash line and turns in the plane of the lid's normal n and 
     d(s) = cos(f) (cos(b) n + sin(b) m) + sin(f) t,   b(s) = b0 + curl s,
 
 where b0 < 0 points towards the fissure. The fan f varies along the lid from one canthus to the other. Lashes grow in
-tufts with gaps between them; those of a tuft are similar, and their tips converge by `clumping`. A lash that would
-enter the skin is lifted out of it.
+tufts with gaps between them; those of a tuft are similar, and by `clumping` they lean to the longest of them on the way
+to its tip, so that a tuft is a pyramid. A lash that would enter the skin is lifted out of it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,14 +26,15 @@ from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
 from .lids import CONJUNCTIVA, EDGE_MM, FINE, LID, MARGIN, Sheet, lash_line
 
-_ABOVE_MM = np.array([0.09, 0.16, 0.2, 0.2, 0.2, 0.2])  # height of the points after the root, which is on the skin
+_ABOVE_MM = np.minimum(0.03 + 0.06 * np.arange(1, SEGMENTS + 1), 0.2)  # height of points after the root, on the skin
 _REACH_ROWS = 12  # rows beyond the crease, about a centimetre, where lashes may meet skin
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
 _NEAR_COLUMNS = 6
 _SEARCH_MM = 1.5  # distance up to which skin lifts a lash
 _NEARLY = 0.2  # share by which the skin that is found may be farther away than the nearest
 _OFF_GLOBE_MM = 0.3  # least distance of the points beyond the root from the globe
-_TIP = 0.22  # radius of the tip over that of the root; the map makes thin tips paler instead (`skin.lash_band`)
+_TIP = 0.15  # radius of the tip over that of the root; the map makes thin tips paler too (`skin.lash_band`)
+_BLOBS = 0.9  # spread of the thickness along a lash with mascara, which dries in lumps (chosen)
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
 
@@ -41,7 +43,8 @@ class LashPlan(ArrayValue):
     """Properties of the lashes that do not depend on the pose.
 
     Each lash has the angle of its column, its position across the margin (0 to 1), length, fan, start, curl, thickness
-    (1 for a full-grown upper lash), and the sideways turn of its outer part.
+    (1 for a full-grown upper lash), the sideways turn of its outer part, the longest lash of its tuft, and how far it
+    joins that one at its tip (0 to 1). `lumps` (n, k) is the thickness of mascara on it.
     """
 
     angle: Floats
@@ -52,16 +55,24 @@ class LashPlan(ArrayValue):
     curl: Floats
     stout: Floats
     sway: Floats
+    leader: Ints
+    tight: Floats
+    lumps: Floats
 
 
 @lru_cache(maxsize=16)
 def plan(spec: Lashes, seed: int, left: bool = False) -> LashPlan:
     """Draw the lashes of a subject's right or left eye, independently; upper ones first."""
-    parts = [_lid(spec, (seed, int(upper), *([1] if left else [])), upper) for upper in (True, False)]
-    return LashPlan(*(frozen(np.concatenate([p[i] for p in parts])) for i in range(8)))
+    upper, lower = (
+        _lid(spec, (seed, int(above), *([1] if left else [])), above, 0 if above else spec.upper_count)
+        for above in (True, False)
+    )
+    columns: list[Any] = [frozen(np.concatenate(pair), pair[0].dtype) for pair in zip(upper, lower, strict=True)]
+    return LashPlan(*columns)
 
 
-def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
+def _lid(spec: Lashes, key: tuple[int, ...], upper: bool, first: int) -> tuple[Any, ...]:
+    """Draw the lashes of one lid, of which the first has the number `first`."""
     rng = np.random.default_rng((0x1A5, *key))
     count = spec.upper_count if upper else spec.lower_count
     # The margins have no lashes between the lacrimal puncta and the nose.
@@ -75,14 +86,15 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
     place += 0.55 * spec.clumping * (_means(place, tuft) - place)
     # Lashes are denser towards the temple.
     a = low + (high - low) * np.clip(place, 0, 1) ** 1.08
-    across = rng.choice([0.76, 0.87, 0.97], count, p=[0.25, 0.4, 0.35]) + rng.normal(0, 0.03, count)
+    # Their roots stand in uneven rows over a third of the margin.
+    across = np.clip(rng.uniform(0.66, 0.98, count) + rng.normal(0, 0.03, count), 0.5, 1.0)
     # They are longest slightly temporal of the middle and short at both ends.
     end = (a - low) / (high - low)
     profile = 0.45 + 0.55 * np.sin(np.pi * np.clip(end, 0, 1) ** 0.9) ** 0.6
     most = spec.upper_length_mm if upper else spec.lower_length_mm
     # Lashes of all ages stand side by side: most are full-grown, some are short.
-    young = rng.uniform(size=count) < 0.25
-    length = np.where(young, rng.uniform(0.25, 0.65, count), rng.triangular(0.6, 0.88, 1.0, count))
+    young = rng.uniform(size=count) < 0.35
+    length = np.where(young, rng.uniform(0.2, 0.65, count), rng.triangular(0.6, 0.88, 1.0, count))
     length *= most * profile * _shared(rng.uniform(0.82, 1.0, count), tuft)
     spread = np.radians(spec.spread_deg)
 
@@ -97,29 +109,25 @@ def _lid(spec: Lashes, key: tuple[int, ...], upper: bool) -> tuple[Floats, ...]:
         fan += stray * both(0.8, 0.65)
         sway = stray * both(1.4, 1.1)
     else:
-        # Lower lashes leave the margin to the sides and arch down, so they look like hooks.
-        root, tip = 0.6 * fan + stray * both(1.9, 1.3), 0.5 * fan + stray * both(1.2, 1.0)
+        # Lower lashes leave the margin to both sides and arch down.
+        root, tip = 0.5 * fan + stray * both(0.9, 1.0), 0.5 * fan + stray * both(0.7, 0.8)
         fan, sway = 2 * root, tip - 2.4 * root
     droop = np.radians(spec.upper_droop_deg if upper else 22.0)
     start = -droop + spread * both(0.6, 0.4)
     curl = np.radians(spec.upper_curl_deg if upper else spec.lower_curl_deg)
     curl = curl * np.clip(1 + both(0.16, 0.12), 0.4, 1.5)
-    # The tips of a tuft lean together, some just past each other.
-    offset_mm = 14.5 * (_means(a, tuft) - a)
     clumping = spec.clumping + 0.6 * spec.mascara * (1 - spec.clumping)
-    tight = clumping * _shared(rng.uniform(0.6, 1.5, count), tuft)
-    lean = tight * np.arctan(offset_mm / np.maximum(length, 1.0))
-    # Half of it is in their outer part, so they stand apart at the roots and meet at the tips.
-    fan += 0.5 * lean
-    sway += 0.8 * lean
+    tight = np.clip(clumping * _shared(rng.uniform(0.5, 2.0, count), tuft), 0, 0.97)
+    leader = np.lexsort((-length, tuft))[np.searchsorted(tuft, tuft)] + first
     angle = np.arccos(np.clip(a, -1, 1)) if upper else 2 * np.pi - np.arccos(np.clip(a, -1, 1))
     stout = (1.0 if upper else 0.75) * np.clip(0.5 + 0.55 * length / most, 0.0, 1.0) * rng.uniform(0.75, 1.1, count)
-    return angle, across, length, fan, start, curl, stout, sway
+    lumps = spec.mascara * np.abs(rng.normal(0, _BLOBS, (count, SEGMENTS + 1))) * np.linspace(0.3, 1.0, SEGMENTS + 1)
+    return angle, across, length, fan, start, curl, stout, sway, leader, tight, lumps
 
 
 def _tufts(rng: np.random.Generator, count: int) -> Ints:
     """Return the number of each lash's tuft; a tuft has one to six lashes."""
-    sizes = rng.choice([1, 2, 3, 4, 5, 6], max(count, 1), p=[0.24, 0.2, 0.2, 0.17, 0.12, 0.07])
+    sizes = rng.choice([1, 2, 3, 4, 5, 6], max(count, 1), p=[0.16, 0.16, 0.22, 0.2, 0.16, 0.1])
     return np.repeat(np.arange(len(sizes)), sizes)[:count].astype(np.int64)
 
 
@@ -163,7 +171,7 @@ def free_lashes(spec: Region, globe: Globe) -> Hairs:
 
 def _radii(spec: Region, p: LashPlan) -> Floats:
     thick = spec.lashes.diameter_mm * (1 + 0.7 * spec.lashes.mascara)
-    return frozen(taper(len(p.angle), thick, np.linspace(0, 1, SEGMENTS + 1), _TIP) * p.stout[:, None])
+    return frozen(taper(len(p.angle), thick, np.linspace(0, 1, SEGMENTS + 1), _TIP) * p.stout[:, None] * (1 + p.lumps))
 
 
 def _grown(spec: Region, p: LashPlan, c: Contour, line: Floats) -> tuple[Floats, Floats, float]:
@@ -195,6 +203,12 @@ def _grown(spec: Region, p: LashPlan, c: Contour, line: Floats) -> tuple[Floats,
     d = np.cos(f) * (np.cos(b) * n[:, None] + np.sin(b) * m[:, None]) + np.sin(f) * t[:, None]
     points[:, 1:] = (p.length_mm[:, None] * np.diff(ends))[..., None] * d
     points = np.cumsum(points, axis=1)
+    # A lash of a tuft leans to its longest one, more the nearer its tip.
+    place = ends * (p.length_mm / np.maximum(p.length_mm[p.leader], 1e-9))[:, None]
+    j = np.minimum(np.searchsorted(ends, place, side="right") - 1, k - 2)
+    w = ((place - ends[j]) / (ends[j + 1] - ends[j]))[..., None]
+    led = p.leader[:, None]
+    points += (p.tight[:, None] * ends**1.5)[..., None] * ((1 - w) * points[led, j] + w * points[led, j + 1] - points)
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
     return points, straight, fold_back

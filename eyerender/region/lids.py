@@ -33,7 +33,7 @@ _HELD = step(np.arange(LID + FACE, dtype=float), LID + 0.19 * FACE, LID + 0.68 *
 ROWS = CONJUNCTIVA + MARGIN + LID + FACE
 FINE = CONJUNCTIVA + 1  # rows with a position in every column; the others have one in every second column
 _DIP_MM = 0.031
-EDGE_MM = 0.26  # depth of the margin's rounded edges
+EDGE_MM = 0.14  # depth of the margin's rounded edges: it is a flat strip
 LOWER_TILT_DEG = 16.0  # the upper margin faces down and is seen edge-on; the lower one opens upwards by so much more
 _FAR_MM = (66.0, 58.0)
 # Rows are dense at both ends of the lid: at the lash line for what is wet, at the crease for its fold.

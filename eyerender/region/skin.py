@@ -24,6 +24,7 @@ from ..base.arrays import Bools, Floats, Singles, frozen
 from .anatomy import Region
 from .brow import brow_band
 from .contour import step
+from .folds import fold_depths
 from .globe import Globe
 from .lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet, skin_depth
 from .look import Look
@@ -36,6 +37,7 @@ LASH, BROW, TEAR = 0, 1, 2
 SPECTACLES_ROW = BANDS - 4  # texel of the band of spectacle frames, whose albedo is its coordinate u
 LASH_U = (0.05, 0.4)  # coordinate u of an upper lash's root, and how far its tip is from there; lower ones add 1/2
 _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
+_CREASE = CONJUNCTIVA + MARGIN + LID  # and that of the crease
 _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
 _SLOW, _SLOW_TILE = 4, 320  # rows and columns of the map from one place of a slow field to the next; side of its tiles
@@ -50,7 +52,7 @@ _MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 # (Elder 1997, Ophthal Plast Reconstr Surg 13, 21), and light of 850 nm gets that deep. The strip is as wide as the
 # rows of lashes, blurred by scattering. Chosen are its middle from the lash line and its width, and the loss of light
 # where the diameters of all lashes of a lid add up to those of 120 lashes of 0.085 mm.
-_ROOTS_MM, _ROOTS_LOSS, _MANY = (-0.25, 0.45), 0.25, 120 * 0.085
+_ROOTS_MM, _ROOTS_LOSS, _MANY = (-0.25, 0.45), 0.10, 120 * 0.085
 _WET, _WET_ROOT = 0.97, 0.06  # gloss of wet tissue, and the share of a lash that is wet
 _SHOWN_MM = 25.0  # radius about the middle of the fissure: the skin whose mean albedo is that of the spec
 _REFERENCE_BLINK = 0.3  # blink at which the tissue is laid out: neither stretched nor hidden in the fold
@@ -111,6 +113,7 @@ def _draw_sheet(spec: Region, rest: Floats, rows: Floats, columns: Floats, out: 
     y, z, out_mm = (_over_grid(v, rows, columns) for v in (closed[..., 1], closed[..., 2], _from_line(rest)))
     turn = 2 * np.pi * columns / rest.shape[1]
     tiles, spots = _Tiles(spec), _spots(spec.seed, y, z)
+    folded = fold_depths(spec.seed, spec.skin.folds, y, z) * step(out_mm, 1.0, 2.5) if spec.skin.folds else None
     some = slice(None, None, _SLOW)
     slow = _Slow(tiles, y[some, some], z[some, some], out_mm[some, some], np.sin(turn[some]) > 0)
     height = np.empty((SHEET_ROWS, _COLUMNS), np.float32)
@@ -126,7 +129,7 @@ def _draw_sheet(spec: Region, rest: Floats, rows: Floats, columns: Floats, out: 
             slow=slow,
             strip=k,
         )
-        out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k])
+        out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k], None if folded is None else folded[k])
     _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
     _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
 
@@ -161,7 +164,7 @@ def _keratinised(rows: NDArray[Any]) -> NDArray[Any]:
 
     The two meet on the margin, 1.4 mm (above) or 1.0 mm (below) behind the lash line (Zhu et al. 2022).
     """
-    return step(rows, CONJUNCTIVA + 0.5, CONJUNCTIVA + 3.0)
+    return step(rows, CONJUNCTIVA - 0.5, CONJUNCTIVA + 2.0)
 
 
 def _normalise(albedo: Singles, y: Singles, z: Singles, rows: Floats, wanted: float) -> None:
@@ -388,12 +391,21 @@ class _Strip:
         """Return a slowly varying field."""
         return self.slow.at(name, self.strip)
 
-    def look(self, spots: Singles) -> tuple[Singles, Singles, Singles]:
-        """Compute albedo, gloss and height (mm) of the relief; `spots` is the share of light left by freckles."""
+    def look(self, spots: Singles, folded: Singles | None) -> tuple[Singles, Singles, Singles]:
+        """Compute albedo, gloss and height (mm) of the relief.
+
+        Args:
+            spots: share of light left by freckles.
+            folded: depth, 0 to 1, of the folds of age; None without any.
+        """
         spec = self.spec
         cells, creases, pores, wet, bumps = self.cells(), self.creases(), self.pores(), self.wet(), self.bumps()
         height = self.relief(cells) + 0.7 * spec.skin.relief_mm * bumps
         height = height - 0.03 * pores - 0.17 * spec.skin.wrinkles * creases
+        if folded is not None:
+            streaks = spec.skin.folds * self.lids * self.tiles.at(55, self.along, (1, 7), (26, 64))
+            height = height - 0.25 * folded + 0.04 * streaks
+            spots = spots * (1 - 0.25 * folded) * (1 + 0.05 * streaks)
         height *= self.lid
         if np.min(self.out_mm) < _WET_END_MM:
             # Water fills the furrows.
@@ -411,7 +423,8 @@ class _Strip:
         film *= 0.25 + 5 * np.clip(bumps - 0.5, 0, 1)
         film = film * (0.3 + 0.7 * cells) * (1 - pores) * (1 - 0.7 * creases)
         sheen = spec.skin.sheen * np.clip(film, 0.04, 2.0)
-        gloss = np.where(wet > 0, wet, np.minimum(sheen, 0.49) * self.lid)
+        # A film fades to a gloss of 0.5, not through that of oil, which would shine in a line along its edge.
+        gloss = np.where(wet > 0.5, wet, np.minimum(sheen, 0.45) * self.lid)
         return self.albedo(open_, spots), gloss, height
 
     def wet(self) -> Singles:
@@ -424,7 +437,9 @@ class _Strip:
             tongues = self.tiles.at(43, _places(self.y, self.out_mm / 3), (10, 60), (10, 60))
             reach = np.where(self.upper > 0, np.float32(0.5), np.float32(0.25))  # the upper lashes hold more water
             film = 1 - step(self.out_mm - reach - 0.35 * tongues, -0.15, 0.15)
-            out = film * np.clip(0.95 - 0.03 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
+            # The strip of the margin between the moist edge and the lash roots is skin, with a few wet points.
+            dry = step(self.rows, CONJUNCTIVA + 0.5, CONJUNCTIVA + 2.0) * step(1.2 - tongues, -0.2, 0.2)
+            out = film * (1 - dry) * np.clip(0.95 - 0.03 * self.field(44, (10, 40), (10, 40)), 0.7, 1.0)
         return out
 
     def lumps(self) -> Singles:
@@ -551,7 +566,7 @@ class _Strip:
         lashes, along = self.spec.lashes, np.cos(self.turn).astype(np.float32)
         count = np.where(self.upper > 0, lashes.upper_count, lashes.lower_count)
         liner = np.where(self.upper > 0, 0.45, 0.1) * lashes.mascara
-        loss = _ROOTS_LOSS * count * lashes.diameter_mm / _MANY + liner
+        loss = _ROOTS_LOSS * count * lashes.diameter_mm / _MANY + liner + 0.6 * self.spec.skin.liner
         loss = loss * step(along, -1.0, -0.85) * (1 - step(along, 0.55, 0.75))
         uneven = 1 + 0.4 * self.tiles.at(45, _places(self.y[near], self.out_mm[near]), (12, 90), (12, 60))
         out[near] = (loss * _bell(self.out_mm, *_ROOTS_MM))[near] * uneven
@@ -562,13 +577,18 @@ class _Strip:
         skin, rows, upper = self.spec.skin, self.rows, self.upper
         # Finer mottling than half a millimetre would show the lattice of the map as a weave.
         slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (25, 85)))
-        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.02, 22, *blotch), (0.012, 23, *fine))
+        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.035, 22, *blotch), (0.025, 23, *fine))
         tone = (1 + skin.mottling * mottled) * open_
         tone *= 1 - skin.veins * self.veins()
         tone *= self.slowly("shade")
         tone *= 1 - self.lash_line()
         tone *= 1 - 0.06 * step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + LID) * self.near * (upper > 0)
         tone *= 1 - self.under_brow()
+        if skin.shadow:
+            lid = step(rows, CONJUNCTIVA + MARGIN, CONJUNCTIVA + MARGIN + 1) * (
+                1 - step(rows, _CREASE - 1, _CREASE + 2)
+            )
+            tone *= 1 - 0.35 * skin.shadow * lid * step(upper, 0.15, 0.5)
         # In the crease, skin lies against skin.
         tone *= 1 - 0.12 * _bell(rows, CONJUNCTIVA + MARGIN + LID - 0.7, 0.9) * step(upper, 0.12, 0.75)
         outer = skin.albedo * tone * spots

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Singles, frozen
+from ..rig.camera import Window
 from .glints.splatting import MirrorImages, Shine
-from .integrator.film import coarse_sensor, mean_radiance, start
+from .integrator.film import Means, coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import BoundFrame, HostData
 from .output.geometry import Hits, window_hits
@@ -26,6 +27,8 @@ from .scene.region import RegionScene
 
 if TYPE_CHECKING:
     from ..backends.choose import Backend
+
+_SIZES = 32  # px
 
 
 class Renderer:
@@ -86,10 +89,11 @@ class Renderer:
         """Trace a job, or the sub-frames of its exposure; take labels and glints from mid-exposure."""
         parts = moments or (SubFrames(jobs=(job,)),)
         shots = [(shot, part) for part in parts for shot in part.jobs]
-        # The light that moments share is that of the middle, from which they differ least.
+        # The light that moments share is that of the middle, from which they differ least; lids move little from each
+        # moment to the next.
         middle = len(shots) // 2
-        shots = [shots[k] for k in sorted(range(len(shots)), key=lambda k: abs(k - middle))]
-        spp = max(1, (spp or self.spp) // _shots_of_a_row(parts))
+        shots = shots[middle::-1] + shots[middle + 1 :]
+        film = _Film(spp or self.spp, parts)
         blur: Blur | None = None
         pictures: dict[int, list[Singles]] = {id(part): [] for part in parts}
         glints: dict[int, list[Shine]] = {id(part): [] for part in parts}
@@ -98,19 +102,21 @@ class Renderer:
         rows: list[tuple[Bools, PartLabels]] = []
         around: Callable[[], Singles] | None = None
         lit: dict[tuple[float, ...], DeviceFrame] = {}  # a frame for each state of the lamps
+        images: MirrorImages | None = None
         for shot, part in shots:
-            lamps = tuple(lamp.intensity_mw_sr for lamp in shot.lights)
+            lamps = _lamps(shot)
             bound, surroundings = self._builder.set(shot, after=None if moments else after, before=lit.get(lamps))
             lit.setdefault(lamps, bound.frame)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
-            means = start(bound, blur.window, spp, shot.seed, layered=blur.layered)
+            means = film.start(bound, blur, part)
             if shot is shots[0][0]:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job, surroundings) if _is_middle(shot, job) else None
             own = None if part.labelled is None else part_labels(bound, job.window)
             self._builder.prepare()
-            mirrored, shines = self._mirror_images(bound.host).seen(surroundings, blur, 1 / len(part.jobs))
+            images = self._mirror_images(bound.host, images)
+            mirrored, shines = images.seen(surroundings, blur, 1 / len(part.jobs))
             glints[id(part)] += shines
             mean, missed = means()
             pictures[id(part)].append(mean)
@@ -137,12 +143,13 @@ class Renderer:
             lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around(),
         )  # fmt: skip
 
-    def _mirror_images(self, host: HostData) -> MirrorImages:
+    def _mirror_images(self, host: HostData, before: MirrorImages | None = None) -> MirrorImages:
         """Compute the lamps' mirror images, in the closed-form cornea or its mesh."""
         job = host.job
-        if job.mesh_edge_mm is None:
+        if job.mesh_edge_mm is None and before is None:
             return host.mirror_images
-        return MirrorImages.of(job, self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0])
+        mesh = None if job.mesh_edge_mm is None else self._builder.meshes.of(job.eye, job.mesh_edge_mm)[0]
+        return MirrorImages.of(job, mesh, before)
 
     def radiance(self, job: RenderJob, *, spp: int | None = None) -> Floats:
         """Render the mean of radiance times cos^4(theta) / D (mW/mm^2/sr) per pixel, before lens and glints."""
@@ -159,6 +166,65 @@ class Renderer:
         lit: whether to compute light, not only geometry.
         """
         return self._builder.set(job, lit=lit)
+
+
+def _lamps(job: RenderJob) -> tuple[float, ...]:
+    """Return the state of a job's lamps."""
+    return tuple(lamp.intensity_mw_sr for lamp in job.lights)
+
+
+class _Film:
+    """Pictures of moments, which differ from the first one under the same lamps in their moving part and rows alone.
+
+    Args:
+        spp: samples per pixel of the whole exposure.
+        parts: its moments.
+    """
+
+    def __init__(self, spp: int, parts: Sequence[SubFrames]) -> None:
+        self._spp, self._each = spp, max(1, spp // _shots_of_a_row(parts))
+        self._still: dict[tuple[float, ...], Singles] = {}
+
+    def start(self, bound: BoundFrame, blur: Blur, part: SubFrames) -> Means:
+        """Start rendering a moment, as `film.start` does."""
+        job, whole = bound.host.job, blur.window
+        base = self._still.get(_lamps(job))
+        if base is None:
+            stands = _inside(whole, part.moving) != whole
+            means = start(bound, whole, self._spp if stands else self._each, job.seed, layered=blur.layered)
+            window = whole
+        else:
+            window = _inside(whole, part.moving, part.rows)
+            means = start(bound, window, self._each, job.seed, layered=blur.layered)
+
+        def read() -> tuple[Singles, int]:
+            mean, failed = means()
+            picture = mean if base is None else base.copy()
+            x, y = window[0] - whole[0], window[1] - whole[1]
+            picture[..., y : y + window[3], x : x + window[2]] = mean
+            self._still.setdefault(_lamps(job), picture)
+            return picture, failed
+
+        return read
+
+
+def _inside(window: Window, part: Window | None, rows: Floats | None = None) -> Window:
+    """Return a part of a window, in those of its rows that get light; all of it without a part.
+
+    Its sizes are multiples of `_SIZES`, because each size has recordings of its own. `rows` are those of the window
+    without the border that the lens needs.
+    """
+    low, size = np.array(window[:2]), np.array(window[2:])
+    first, last = (low, low + size) if part is None else (np.array(part[:2]), np.add(part[:2], part[2:]))
+    if rows is not None:
+        pad, lit = (window[3] - len(rows)) // 2, np.flatnonzero(rows)
+        first = np.maximum(first, [first[0], low[1] + lit[0]])
+        last = np.minimum(last, [last[0], low[1] + lit[-1] + 2 * pad + 1])
+    first = np.clip(first, low, low + size - 1)
+    wanted = np.clip(last, first + 1, low + size) - first
+    wanted = np.minimum(-(-wanted // _SIZES) * _SIZES, size)
+    first = np.minimum(first, low + size - wanted)
+    return int(first[0]), int(first[1]), int(wanted[0]), int(wanted[1])
 
 
 def _shots_of_a_row(parts: Sequence[SubFrames]) -> int:

@@ -16,30 +16,18 @@ from .style import ANALYTIC_ON_DARK, IMAGE_ON_DARK
 
 
 def eye_picture(
-    image: NDArray[Any],
-    origin_px: tuple[int, int],
-    full_scale: float,
-    truth: Observations,
-    found: Observations,
-    row: int,
+    image: NDArray[Any],  # (h, w) linear counts of a window
+    origin_px: tuple[int, int],  # the window's first pixel on the full sensor
+    full_scale: float,  # counts that are drawn white
+    truth: Observations,  # observations of the analytic observer
+    found: Observations,  # observations of the image observer
+    row: int,  # this image's row in both
     *,
-    crop_px: tuple[int, int] = (128, 96),
-    scale: int = 4,
-    title: str = "",
+    crop_px: tuple[int, int] = (128, 96),  # width and height of the crop, centred on the iris (or the window)
+    scale: int = 4,  # screen pixels per sensor pixel
+    title: str = "",  # text alternative
 ) -> str:
-    """Draw an enlarged <svg> of the eye with analytic (blue) and image-derived (orange) pupil and glints.
-
-    Args:
-        image: (h, w) linear counts of a window.
-        origin_px: the window's first pixel on the full sensor.
-        full_scale: counts that are drawn white.
-        truth: observations of the analytic observer.
-        found: observations of the image observer.
-        row: this image's row in both.
-        crop_px: width and height of the crop, centred on the iris (or the window).
-        scale: screen pixels per sensor pixel.
-        title: text alternative.
-    """
+    """Draw an enlarged <svg> of the eye with analytic (blue) and image-derived (orange) pupil and glints."""
     h, w = image.shape
     cw, ch = min(crop_px[0], w), min(crop_px[1], h)
     centre = np.array([(w - 1) / 2, (h - 1) / 2]) + origin_px

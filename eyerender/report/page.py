@@ -47,19 +47,12 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Gallery:
-    """Pictures in a grid, each as markup and lines of text, of which the first is its name.
+    """Pictures in a grid, each as markup and lines of text, of which the first is its name."""
 
-    Attributes:
-        pictures: the pictures.
-        heading: a heading above them.
-        width_rem: smallest width of a picture.
-        rows: number of rows, filled column by column; None: as many columns as fit, filled row by row.
-    """
-
-    pictures: Sequence[tuple[str, Sequence[str]]]
-    heading: str = ""
-    width_rem: float = 13.5
-    rows: int | None = None
+    pictures: Sequence[tuple[str, Sequence[str]]]  # the pictures
+    heading: str = ""  # a heading above them
+    width_rem: float = 13.5  # smallest width of a picture
+    rows: int | None = None  # number of rows, filled column by column; None: as many columns as fit, filled row by row
 
 
 @dataclass(frozen=True, slots=True)

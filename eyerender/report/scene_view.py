@@ -12,7 +12,7 @@ from ..optics.triangles import sharp_edges
 from ..rig.camera import PinholeCamera
 from ..scene import Scene
 from ..scene.observation import EYES, Observations
-from .style import ANALYTIC, IMAGE, TARGET, figure
+from .style import ANALYTIC, CAMERA, IMAGE, TARGET, figure
 
 MAX_NOTES = 4
 """Largest number of reasons for missing rays that a figure lists."""
@@ -95,10 +95,10 @@ def _camera(ax: Any, scene: Scene, number: int) -> None:
     camera = scene.rig.cameras[number]
     origin = camera.nodal_point_mm
     ends = camera.corners((0, 0, *camera.resolution_px), float(np.linalg.norm(origin)) / 8)
-    ax.plot(*ends.T, color=ANALYTIC, lw=1.0)
+    ax.plot(*ends.T, color=CAMERA, lw=1.0)
     for end in ends[:4]:
-        ax.plot(*np.stack([origin, end]).T, color=ANALYTIC, lw=1.0)
-    ax.scatter(*origin, color=ANALYTIC, s=36, depthshade=False, label="camera" if number == 0 else None)
+        ax.plot(*np.stack([origin, end]).T, color=CAMERA, lw=1.0)
+    ax.scatter(*origin, color=CAMERA, s=36, depthshade=False, label="camera" if number == 0 else None)
 
 
 def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from ..base.apart import imported_apart
 from ..base.arrays import Floats
 
-ANALYTIC, IMAGE, TARGET = "#0072B2", "#D55E00", "#222222"
+ANALYTIC, IMAGE, TARGET, CAMERA = "#0072B2", "#D55E00", "#222222", "#5B3A8C"
 # These are the same two hues, light enough for dark images.
 ANALYTIC_ON_DARK, IMAGE_ON_DARK = "#56B4E9", "#FF9F1C"
 

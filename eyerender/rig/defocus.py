@@ -45,14 +45,7 @@ _LEAST_SHARE = 1e-3  # smallest share of a pixel; rounding of coverages leaves l
 
 
 def confusion_px(lens: Lens, camera: PinholeCamera, sensor: Sensor, depth_mm: Floats | float) -> Floats:
-    """Compute the diameters (px) of the circles of confusion of points at given depths.
-
-    Args:
-        lens: provides the distance in focus.
-        camera: the camera.
-        sensor: provides working f-number and pixel pitch.
-        depth_mm: depths of the points along the optical axis.
-    """
+    """Compute the diameters (px) of the circles of confusion of points at depths along the optical axis."""
     return confusion_of(lens, camera, sensor, 1 / np.maximum(np.asarray(depth_mm, dtype=float), 1e-3))
 
 
@@ -80,10 +73,7 @@ def checked(diameter_px: float) -> float:
 def one_blur(diameters_px: Floats, subject_px: float, sigma_px: float) -> bool:
     """Return whether the subject's kernel serves all depths: the total blur differs by less than 3 %.
 
-    Args:
-        diameters_px: circles of confusion of the nearest and farthest objects.
-        subject_px: circle of confusion of the subject.
-        sigma_px: standard deviation of the point-spread function.
+    The circles of confusion are those of the nearest and farthest objects, and of the subject.
     """
     own = subject_px**2 / 16 + sigma_px**2 + _PIXEL_VARIANCE
     width = np.sqrt((np.asarray(diameters_px) ** 2 - subject_px**2) / 16 / own + 1)
@@ -135,17 +125,11 @@ def reach_px(diameter_px: float) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer(ArrayValue):
-    """One depth layer of an image, with arrays (height, width).
+    """One depth layer of an image, with arrays (height, width)."""
 
-    Attributes:
-        radiance: sum over the pixel's samples that hit the layer, divided by the number of all samples.
-        coverage: share of the samples that hit the layer.
-        confusion_px: diameter of the circle of confusion; undefined where the coverage is 0.
-    """
-
-    radiance: Reals
-    coverage: Reals
-    confusion_px: Floats
+    radiance: Reals  # sum over the pixel's samples that hit the layer, divided by the number of all samples
+    coverage: Reals  # share of the samples that hit the layer
+    confusion_px: Floats  # diameter of the circle of confusion; undefined where the coverage is 0
 
 
 def blurred(layers: Sequence[Layer], reach: int) -> Singles:

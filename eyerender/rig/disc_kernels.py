@@ -45,9 +45,7 @@ def spread(pictures: Singles, index: Ints, discs: Singles, reaches: Ints, sums: 
 def continue_nearest(values: Singles, steps: NDArray[np.int32]) -> None:
     """Fill unknown pixels, in place, with the nearest known value, counting steps along rows and columns.
 
-    Args:
-        values: (height, width).
-        steps: (height, width) int32; 0 where the value is known, elsewhere more than height + width.
+    `steps` (height, width) is 0 where the value is known, elsewhere more than height + width.
     """
     height, width = values.shape
     for y in range(height):

@@ -48,14 +48,7 @@ def electrons(sensor: Sensor, irradiance: Floats, wavelength_nm: float) -> Float
 
 
 def iris_radiance(lamps: Iterable[Lamp], eye_mm: Floats, albedo: float, ambient_w_m2: float = 0.0) -> float:
-    """Compute the radiance (mW/mm^2/sr) of a matte iris, in air, of an eye that faces every lamp.
-
-    Args:
-        lamps: lamps that light the eye.
-        eye_mm: (3,) corneal apex in the world.
-        albedo: albedo of the iris.
-        ambient_w_m2: irradiance by other light.
-    """
+    """Compute the radiance (mW/mm^2/sr) of a matte iris, in air, of an eye at `eye_mm` that faces every lamp."""
     irradiance = 1e-3 * ambient_w_m2
     for lamp in lamps:
         intensity, _, distance = lamp.towards(eye_mm)
@@ -64,13 +57,9 @@ def iris_radiance(lamps: Iterable[Lamp], eye_mm: Floats, albedo: float, ambient_
 
 
 def automatic_exposure(sensor: Sensor, radiance: float, *, lit: bool, wavelength_nm: float) -> Sensor:
-    """Choose exposure time and, if that is not enough, gain, so that an iris of a radiance has `IRIS_LEVEL`.
+    """Choose exposure time and, if need be, gain, so that an iris of a radiance (mW/mm^2/sr) has `IRIS_LEVEL`.
 
-    Args:
-        sensor: a sensor without exposure time and gain.
-        radiance: radiance of the iris, mW/mm^2/sr.
-        lit: whether LEDs light the eye, which a headset strobes for some milliseconds.
-        wavelength_nm: wavelength of the light.
+    The sensor has neither; `lit` says whether LEDs light the eye, which a headset strobes for some milliseconds.
     """
     longest = sensor.exposure_max_ms or (_LONGEST_MS if lit else DEFAULT_EXPOSURE_MS)
     irradiance = np.array(radiance_to_irradiance(sensor) * radiance)
@@ -121,16 +110,10 @@ def expose(
 def expose_again(
     sensor: Sensor, codes: NDArray[np.uint16], seed: int, corner_px: tuple[int, int] = (0, 0)
 ) -> NDArray[np.uint16]:
-    """Add noise to an image that was stored without noise.
+    """Add noise to codes (h, w) that were stored without noise, whatever the sensor's switch `noise`.
 
     The codes determine each pixel's mean charge, except at full scale, where pixels stay saturated. The noise of a
-    camera that sharpens is not sharpened.
-
-    Args:
-        sensor: the sensor; its switch `noise` is ignored.
-        codes: (h, w) codes of an exposure without noise.
-        seed: seed of the noise.
-        corner_px: sensor coordinates (x, y) of the array's first pixel.
+    camera that sharpens is not sharpened. Seed and corner are those of `expose`.
     """
     full = sensor.full_scale_dn
     linear = full * (codes / full) ** sensor.gamma

@@ -111,25 +111,15 @@ class Mirror(Spec):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MirrorPlate(ArrayValue):
-    """A mirror in the frame of the virtual camera behind it, which a rigid motion of both does not change.
+    """A mirror in the frame of the virtual camera behind it, which a rigid motion of both does not change."""
 
-    Attributes:
-        normal: (3,) unit vector from the camera to the plane.
-        distance_mm: distance of the plane.
-        corners_mm: (k, 3) corners of the outline in the plane; None: no edges.
-        reflectance: of the plane.
-        thickness_mm: of the glass.
-        index: of the glass.
-        back_reflectance: of the back of the glass; None: Fresnel's.
-    """
-
-    normal: Floats
-    distance_mm: float
-    corners_mm: Floats | None
-    reflectance: float
-    thickness_mm: float
-    index: float
-    back_reflectance: float | None
+    normal: Floats  # (3,) unit vector from the camera to the plane
+    distance_mm: float  # distance of the plane
+    corners_mm: Floats | None  # (k, 3) corners of the outline in the plane; None: no edges
+    reflectance: float  # of the plane
+    thickness_mm: float  # of the glass
+    index: float  # of the glass
+    back_reflectance: float | None  # of the back of the glass; None: Fresnel's
 
     @property
     def has_ghosts(self) -> bool:

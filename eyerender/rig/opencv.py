@@ -103,11 +103,7 @@ def _one_camera(found: dict[str, Any], camera: str | None, source: str) -> dict[
 
 
 def calibration_of(found: dict[str, Any], source: str) -> OpenCvCalibration:
-    """Read the calibration of one camera from keys and values.
-
-    Raises:
-        InputError: naming the key.
-    """
+    """Read the calibration of one camera from keys and values; InputError naming the key."""
     problems = Problems(source)
     data = _named(found, problems)
     if "p" in data:

@@ -109,22 +109,15 @@ def timing_warnings(timings: Sequence[FrameTimes]) -> list[InputWarning]:
 
 
 def place_warnings(
-    rig: RigGeometry,
-    eyes_mm: Mapping[str, Floats],
-    heads_mm: Mapping[str, Floats],
-    camera_paths: Sequence[str],
-    light_paths: Sequence[str],
+    rig: RigGeometry,  # the rig
+    eyes_mm: Mapping[str, Floats],  # corneal apexes (3,) in the world by their name in a message
+    heads_mm: Mapping[str, Floats],  # head positions (3,) in the world by their name in a message
+    camera_paths: Sequence[str],  # path of each camera in the input, for messages
+    light_paths: Sequence[str],  # path of each lamp in the input; lamps of one ring share a path and get one warning
 ) -> list[InputWarning]:
     """Warn of impossible places: cameras and lamps in a face, in a head or behind the screen, and a screen in a face.
 
     A lamp in none of these places gets a warning if its axis points past the nearest eye.
-
-    Args:
-        rig: the rig.
-        eyes_mm: corneal apexes (3,) in the world by their name in a message.
-        heads_mm: head positions (3,) in the world by their name in a message.
-        camera_paths: path of each camera in the input, for messages.
-        light_paths: path of each lamp in the input; lamps of one ring share a path and get one warning.
     """
     places = [
         *((path, "camera", camera.nodal_point_mm) for path, camera in zip(camera_paths, rig.cameras, strict=True)),
@@ -148,12 +141,7 @@ def place_warnings(
 
 
 def mirror_warnings(cameras: Sequence[Camera], eyes_mm: Mapping[str, Floats]) -> list[InputWarning]:
-    """Warn of a mirror between its camera and an eye that hides the eye instead of showing it.
-
-    Args:
-        cameras: the authored cameras.
-        eyes_mm: corneal apexes (3,) in the world by their name in a message.
-    """
+    """Warn of a mirror between its camera and an eye (named in messages) that hides the eye instead of showing it."""
     found = []
     for k, camera in enumerate(cameras):
         if camera.mirror is None:
@@ -174,10 +162,7 @@ def view_warnings(
 ) -> list[InputWarning]:
     """Warn of cameras whose images show no eye at any head position; a camera without windows is none of them.
 
-    Args:
-        rig: the rig.
-        views: camera -> the windows (x0, y0, width, height) to be rendered, each with the corneal apex (3,) it shows.
-        camera_paths: path of each camera in the input, for messages.
+    `views` are, by camera, the windows to be rendered, each with the corneal apex (3,) it shows.
     """
     seen = {c: [_in_view(rig.cameras[c], window, eye) for window, eye in views[c]] for c in range(len(rig.cameras))}
     blind = [c for c, shown in seen.items() if shown and not any(shown)]

@@ -110,11 +110,7 @@ class Rig(Spec):
         return self._with_leds(leds)
 
     def with_light_copied(self, number: int, moved_mm: ArrayLike) -> Self:
-        """Append a copy of a light at a shifted position; rings are replaced by single LEDs.
-
-        Args:
-            number: number of the light, from 0, counting each LED of a ring.
-            moved_mm: (3,) shift of the copy from that light.
+        """Append a copy of a light, moved by `moved_mm` (3,); rings are replaced by single LEDs, each with its number.
 
         Raises:
             InputError: there is no such light, or there are too many.

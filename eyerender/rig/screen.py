@@ -47,14 +47,7 @@ class Screen(Spec):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreenPlane(ArrayValue):
-    """A screen in the world.
-
-    Attributes:
-        centre_mm: (3,) mm.
-        right: (3,) unit vector along the screen, to the subject's right.
-        up: (3,) unit vector along the screen, up.
-        size_mm: (w, h).
-    """
+    """A screen in the world: centre, unit vectors to the subject's right and up along it, (3,) each, and (w, h) mm."""
 
     centre_mm: Floats
     right: Floats

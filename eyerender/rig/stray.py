@@ -65,11 +65,40 @@ def star_kernel(star: Star) -> Reals:
 def framed(picture: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
     """Compute the image (h, w) behind the lens' openings, in its own precision; radiances in mW/mm^2/sr."""
     for opening in lens.openings:
-        rim = 1e-3 * opening.radiance_w_m2_sr
-        picture = (picture - rim if rim else picture) * transmission(opening, camera, window)
-        if rim:
-            picture += rim
+        through = transmission(opening, camera, window)
+        rim: Reals = np.float32(1e-3 * opening.radiance_w_m2_sr) * (1 - through)
+        if opening.arcs_w_m2_sr:
+            arcs = _arcs(opening, tuple(camera.resolution_px), tuple(window))
+            rim = rim + np.float32(1e-3 * opening.arcs_w_m2_sr) * (1 - through) * arcs
+        picture = picture * through + rim
     return picture
+
+
+@lru_cache(maxsize=8)  # it is the same in every frame of a camera
+def _arcs(opening: Opening, resolution_px: tuple[int, int], window: Window) -> Singles:
+    """Compute arcs of light (h, w), 0 to 1: a lens in its mount, seen obliquely, in a corner that the opening darkens.
+
+    Concentric ellipses, lit from one side each, stand around a disc that is a little brighter than the rim.
+    """
+    rng = np.random.default_rng((0xA2C5, opening.arcs_seed))
+    half, tall = resolution_px[0] / 2, resolution_px[1] / resolution_px[0]
+    corners = np.array([(x, y) for x in (-1.0, 1.0) for y in (-tall, tall)])
+    through = _transmission_at(opening, resolution_px, *(half * corners.T + np.array(resolution_px)[:, None] / 2))
+    corner = corners[rng.choice(4, p=(1.01 - through) / (1.01 - through).sum())]
+    centre = corner * rng.uniform(0.6, 1.0, 2)
+    x0, y0, width, height = window
+    x = (np.arange(x0, x0 + width)[None, :] + 0.5 - resolution_px[0] / 2) / half - centre[0]
+    y = (np.arange(y0, y0 + height)[:, None] + 0.5 - resolution_px[1] / 2) / half - centre[1]
+    turn, flat = rng.uniform(0, np.pi), rng.uniform(0.55, 0.95)
+    u, v = x * np.cos(turn) + y * np.sin(turn), (y * np.cos(turn) - x * np.sin(turn)) / flat
+    r, angle = np.hypot(u, v), np.arctan2(v, u)
+    out = np.full(r.shape, 0.0)
+    size = rng.uniform(0.35, 0.6)
+    for share, wide in ((1.0, 0.05), (0.8, 0.03), *((rng.uniform(0.15, 0.75), rng.uniform(0.015, 0.05)) for _ in "..")):
+        lit = rng.uniform(0.25, 1.0) * (0.5 + 0.5 * np.cos(angle - rng.uniform(0, 2 * np.pi))) ** rng.uniform(1, 3)
+        out += lit * np.exp(-(((r - share * size) / wide) ** 2))
+    out += 0.12 * (1 + np.clip(u / size, -1, 1)) * special.ndtr((size - r) / 0.04)
+    return frozen(np.minimum(out, 1.0), np.float32)
 
 
 def misses_light(lens: Lens, camera: PinholeCamera, window: Window) -> bool:
@@ -99,14 +128,9 @@ def in_blocks(lens: Lens, camera: PinholeCamera, side: int) -> tuple[Lens, Pinho
 
 
 def scattered_around(picture: Reals, around: Reals, lens: Lens, camera: PinholeCamera, window: Window) -> Reals:
-    """Add ghost and glare to the image (h, w) of a window, with light from the whole sensor.
+    """Add ghost and glare to the image (h, w) of a window inside the sensor, with light from the whole sensor.
 
-    Args:
-        picture: the window.
-        around: the whole sensor in blocks of `block_px`; the part inside the window is replaced by `picture`.
-        lens: the lens.
-        camera: the camera.
-        window: the window, inside the sensor.
+    `around` is the whole sensor in blocks of `block_px`; the part inside the window is replaced by `picture`.
     """
     side = block_px(lens)
     whole, (x0, y0, width, height) = around.copy(), window

@@ -85,26 +85,17 @@ class Light(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FrameTimes(ArrayValue):
-    """Times of one camera's frames.
+    """Times of one camera's frames."""
 
-    Attributes:
-        rate_hz: frames per second by the camera's own clock.
-        period_s: time from one frame to the next, by the true clock.
-        phase_s: start of the first frame.
-        exposure_s: exposure time of a row.
-        row_s: time from row to row; 0 with a global shutter.
-        rows: number of rows.
-        field_delay_s: how much later odd rows are exposed than even ones; features are those midway between both.
-        pulses_s: (m, 2) start and end of the pulse of each light, after the start of a frame; -inf and inf without one.
-    """
-
-    rate_hz: float
-    period_s: float
-    phase_s: float
-    exposure_s: float
-    row_s: float
-    rows: int
+    rate_hz: float  # frames per second by the camera's own clock
+    period_s: float  # time from one frame to the next, by the true clock
+    phase_s: float  # start of the first frame
+    exposure_s: float  # exposure time of a row
+    row_s: float  # time from row to row; 0 with a global shutter
+    rows: int  # number of rows
+    # (m, 2) start and end of the pulse of each light, after the start of a frame; -inf and inf without one
     pulses_s: Floats
+    # how much later odd rows are exposed than even ones; features are those midway between both
     field_delay_s: float = 0.0
 
     @property

@@ -126,11 +126,7 @@ class UnitCalibration(Spec):
 def write_unit(path: str | Path, rig: Any, *, R: ArrayLike = _IDENTITY, t_mm: ArrayLike = (0.0, 0.0, 0.0)) -> None:
     """Write the cameras and the LEDs of an authored `Rig` as the file of a device, JSON or YAML by its suffix.
 
-    Args:
-        path: the file.
-        rig: the rig; its mount is left out, and rings become single LEDs.
-        R: (3, 3) rotation, device to world.
-        t_mm: (3,) origin of the device in the world.
+    The rig's mount is left out, and rings become single LEDs. R and t_mm lead from the device to the world.
     """
     turn, shift = np.asarray(R, dtype=float), np.asarray(t_mm, dtype=float)
 

@@ -29,8 +29,6 @@ RECORD_SCHEMA = "eyerender/record/3"
 MAX_BOUNDARY_POINTS, MAX_POINTS = 3600, 50_000_000
 # Largest number of glints of all observations of a batch; each has a status and a reason.
 MAX_GLINTS = 5_000_000
-# Keys of a record that no scene fills yet: further reflections.
-_UNUSED_FEATURES = ("purkinje",)
 # Limits in a record: glints (as many as lights of a rig), characters of a text, and the size of a number.
 _MAX_ENTRIES, _MAX_TEXT, _LARGEST = 1000, 500, 1e30
 
@@ -199,6 +197,13 @@ class LensGlintFeatures(GlintFeatures):
     index: Ints = column()
 
 
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PurkinjeFeatures(GlintFeatures):
+    """Purkinje images of lamps, as glints with `order`: 1 (the glint) to 4 (the lens' back)."""
+
+    order: Ints = column()
+
+
 WHITE = math.sqrt(2.0)
 """RMS-S2S over SD of white noise."""
 
@@ -241,6 +246,7 @@ class Observations(ArrayValue):
     glints: GlintFeatures
     lens_glints: LensGlintFeatures | None = None
     ghost_glints: GlintFeatures | None = None
+    purkinje: PurkinjeFeatures | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -389,7 +395,7 @@ class Observations(ArrayValue):
             "glints": _glint_records(self.glints, i),
             "lens_glints": None if lens_glints is None else _glint_records(lens_glints, i) or None,
             "ghost_glints": None if self.ghost_glints is None else _glint_records(self.ghost_glints, i) or None,
-            **dict.fromkeys(_UNUSED_FEATURES),
+            "purkinje": None if self.purkinje is None else _glint_records(self.purkinje, i) or None,
             # Only extractors have one; records of ray optics do not have the key.
             **({} if np.isnan(pupil.confidence[i]) else {"confidence": float(pupil.confidence[i])}),
         }
@@ -447,9 +453,8 @@ class Observations(ArrayValue):
             glints=GlintFeatures(**reader.glints("glints")),
             lens_glints=reader.lens_glints(),
             ghost_glints=reader.ghost_glints(),
+            purkinje=reader.purkinje(),
         )
-        for key in _UNUSED_FEATURES:
-            reader.values(key)
         reader.problems.check()
         return found
 
@@ -640,6 +645,22 @@ class _Reader:
             return None
         return GlintFeatures(**self.glints("ghost_glints"))
 
+    def purkinje(self) -> PurkinjeFeatures | None:
+        """Read the Purkinje images, which have no covariance."""
+        rows = self.values("purkinje")
+        if all(entries is None for entries in rows):
+            return None
+        found = self.glints("purkinje", without="covariance")
+        order = np.full(found["light"].shape, -1, np.int64)
+        for k, entries in enumerate(rows):
+            for j, one in enumerate(entries if isinstance(entries, list) else ()):
+                number = one.get("order") if isinstance(one, dict) else None
+                if number not in (1, 2, 3, 4):
+                    self.refuse(k, f"purkinje.{j}", "needs order, 1 to 4")
+                else:
+                    order[k, j] = number
+        return PurkinjeFeatures(**found, order=order)
+
     def lens_glints(self) -> LensGlintFeatures | None:
         if all(entries is None for entries in self.values("lens_glints")):
             return None
@@ -654,7 +675,8 @@ class _Reader:
                     surface[k, j], index[k, j] = SURFACES.index(name), number
         return LensGlintFeatures(**found, surface=surface, index=index)
 
-    def glints(self, key: str) -> dict[str, Any]:
+    def glints(self, key: str, without: str = "") -> dict[str, Any]:
+        """Read glints; entries lack the key `without`."""
         absent = not self.complete or key != "glints"
         rows = [[] if entries is None and absent else entries for entries in self.values(key)]
         for k, entries in enumerate(rows):
@@ -669,6 +691,8 @@ class _Reader:
         time_s = np.full((n, m), np.nan)
         for k, entries in enumerate(rows):
             for j, g in enumerate(entries):
+                if without and isinstance(g, dict):
+                    g = {**g, without: None}
                 if not self.complete and isinstance(g, dict):
                     g = {**_NO_GLINT, **g}
                     if g["status"] is None:
@@ -689,19 +713,21 @@ class _Reader:
 
 
 def _glint_records(glints: GlintFeatures, i: int) -> list[dict[str, Any]]:
-    """Write the glints of row i, with surface and index where a lens shows them."""
+    """Write the glints of row i, with surface and index in a lens, or with the order of Purkinje images."""
     # Plain integers: comparing a NumPy integer with a Status takes 20 times as long.
     status = list(map(Status, glints.status[i].tolist()))
     lens = glints if isinstance(glints, LensGlintFeatures) else None
+    images = glints if isinstance(glints, PurkinjeFeatures) else None
     return [
         {
+            **({} if images is None else {"order": int(images.order[i, j])}),
             "light": _count(glints.light[i, j]),
             **({} if lens is None else {"surface": SURFACES[lens.surface[i, j]], "index": int(lens.index[i, j])}),
             "status": status[j].label,
             "reason": glints.reason[i, j] or None,
             "in_image": bool(glints.in_image[i, j]) if status[j] == Status.OK else None,
             "xy_px": _numbers(glints.xy_px[i, j]),
-            "covariance": _numbers(glints.covariance[i, j]),
+            **({"covariance": _numbers(glints.covariance[i, j])} if images is None else {}),
             "time_s": _numbers(glints.time_s[i, j]),
         }
         for j in range(len(status))
@@ -798,7 +824,7 @@ def concatenate(parts: Iterable[Observations]) -> Observations:
 
     joint: dict[str, Any] = {name: joined(name) for name in ("index", "pose", "pupil", "glints")}
     further: tuple[tuple[str, type[GlintFeatures]], ...]
-    further = ("lens_glints", LensGlintFeatures), ("ghost_glints", GlintFeatures)
+    further = ("lens_glints", LensGlintFeatures), ("ghost_glints", GlintFeatures), ("purkinje", PurkinjeFeatures)
     for name, kind in further:
         if any(getattr(b, name) is not None for b in batches):
             own = [getattr(b, name) or kind(status=np.zeros((len(b), 0), np.int8)) for b in batches]

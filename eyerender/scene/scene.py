@@ -20,7 +20,7 @@ from typing import Any, Generic, Literal, Self, TypeVar, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import ArrayValue, Bools, Floats, Indices
+from ..base.arrays import ArrayValue, Bools, Floats, Indices, take_rows
 from ..base.errors import InputError, InputWarning
 from ..base.spec import Side, Spec, file_digest
 from ..base.status import Status
@@ -56,7 +56,7 @@ from ..rig.sensor import Sensor
 from ..rig.timing import FrameTimes
 from .observation import EYES, Index, PoseTruth
 from .spec import EyeDirection, SceneSpec, SubjectSpec, Targets
-from .timeline import at_other_times, instants_of, rig_motions, rows_at, rows_in_time, single_stop, stops_of
+from .timeline import at_other_times, instants_of, rig_motions, rows_at, rows_in_time, stops_of
 
 # Parts worn on a face may press the skin a little. Farther than 45 mm from an eye, the face is only a guess.
 _BELOW_SKIN_MM, _FACE_MM = 2.0, 45.0
@@ -512,6 +512,11 @@ class Scene:
         return self.spec.model_copy(update=placed)
 
     @property
+    def further_purkinje(self) -> tuple[int, ...]:
+        """Orders of the mirror images of the lamps that pictures show besides the glints."""
+        return self.spec.image.purkinje
+
+    @property
     def openings(self) -> tuple[Opening, ...]:
         """Openings through which the cameras look."""
         return self.spec.lens.openings
@@ -703,7 +708,7 @@ class Scene:
         """Build the numeric eye of one row, with the pupil as it is then."""
         eye = self.eye(EYES[index.eye[row]], tuple(index.head_mm[row]))
         stops = self.stops_of(index.take([row]))
-        return eye if stops is None else _with_stop(_Same(eye), single_stop(stops, 0))
+        return eye if stops is None else _with_stop(_Same(eye), take_rows(stops, 0))
 
     def _fixating(self, index: Index) -> PoseTruth:
         # All cameras see the same pose, so each head position, fixation and eye is solved once.

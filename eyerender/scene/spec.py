@@ -31,7 +31,7 @@ from ..population.people import Person, PersonChoice, chosen_person
 from ..region.anatomy import Region
 from ..region.look import Look
 from ..rig.camera import EyeNames, serves
-from ..rig.imaging import Ambient, Lens, Motion, Picture
+from ..rig.imaging import Ambient, Lens, Motion, Picture, samples_for
 from ..rig.rig import Rig
 from ..rig.sensor import Sensor
 from .observation import MAX_GLINTS
@@ -352,7 +352,7 @@ class SceneSpec(FileSpec):
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Move what the subject or its population says to the scene's own keys."""
+        """Move what the subject or its population says to the scene's own keys, and replace `image.spp: auto`."""
         subject = data.get("subject")
         if isinstance(subject, Spec):
             rest = subject.to_mapping()
@@ -360,6 +360,11 @@ class SceneSpec(FileSpec):
             if "eye" in lifted and "eye" in data:
                 raise InputError("is given twice, for the scene and for its subject", path="eye")
             data = {**lifted, **data, "subject": rest}
+        image, sensor = data.get("image"), data.get("sensor", {})
+        if isinstance(image, Mapping) and image.get("spp") == "auto":
+            blur = sensor.get("psf_sigma_px") if isinstance(sensor, Mapping) else getattr(sensor, "psf_sigma_px", None)
+            blur = blur if isinstance(blur, int | float) else Sensor().psf_sigma_px
+            data = {**data, "image": {**image, "spp": samples_for(blur)}}
         return data if data.get("population") is None else _peopled(data)
 
     @classmethod

@@ -7,7 +7,6 @@ different cameras belong to one instant if they are nearest in time, counted in 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Protocol
@@ -29,7 +28,7 @@ from ..rig.timing import FrameTimes
 from .observation import EVENTS, EYES, Index, PoseTruth
 from .sequence.course import MovingEyes
 from .sequence.habits import Habits
-from .sequence.spec import GazeModel
+from .sequence.spec import Aiming, GazeModel
 from .sequence.states import BLINK_PHASES
 from .spec import MAX_OBSERVATIONS, SceneSpec
 
@@ -113,15 +112,20 @@ def _course(keyed: _Keyed) -> MovingEyes:
 
 def _resting_mm(scene: TimedScene, side: str) -> float:
     """Return the diameter of the stop at rest; that of the other eye where only one is observed."""
-    own = side if side in scene.spec.subject.eyes else scene.spec.subject.eyes[0]
-    return scene.responding_file(own).stop.diameter_mm if (given := scene.spec.eye.pupil_diameter_mm) is None else given
+    given = scene.spec.eye.pupil_diameter_mm
+    return scene.responding_file(_observed(scene, side)).stop.diameter_mm if given is None else given
 
 
-def _aim(scene: TimedScene) -> Callable[[Floats, Floats, int], tuple[Floats, Floats]]:
+def _observed(scene: TimedScene, side: str) -> str:
+    """Return a side if its eye is observed, else the side of the first observed eye, whose model it shares."""
+    return side if side in scene.spec.subject.eyes else scene.spec.subject.eyes[0]
+
+
+def _aim(scene: TimedScene) -> Aiming:
     """Return the function that turns an eye, whose pupil is at rest, towards targets."""
 
-    def aim(targets_mm: Floats, head_mm: Floats, eye: int) -> tuple[Floats, Floats]:
-        side = EYES[eye] if EYES[eye] in scene.spec.subject.eyes else scene.spec.subject.eyes[0]
+    def aim(targets_mm: Floats, head_mm: Floats, torsion_rad: Floats, eye: int) -> tuple[Floats, Floats]:
+        side = _observed(scene, EYES[eye])
         base = scene.eye_position_mm(EYES[eye]) + np.array(scene.spec.subject.head_positions_mm[0])
         which = np.zeros(len(targets_mm), dtype=np.intp)
         found = fixations([scene.eye(side)], which, targets_mm, base + head_mm, scene.spec.eye.line_of_sight)
@@ -130,11 +134,9 @@ def _aim(scene: TimedScene) -> Callable[[Floats, Floats, int], tuple[Floats, Flo
             target = ", ".join(f"{v:.4g}" for v in targets_mm[bad[0]])
             reason = found.reason(int(bad[0]))
             raise InputError(f"the {EYES[eye]} eye cannot fixate ({target}) mm: {reason}", path="gaze")
-        poses, gaze = found.poses, scene.spec.sequence.gaze if scene.spec.sequence else None
-        torsion = gaze.torsion_deg if isinstance(gaze, GazeModel) else 0.0
-        if isinstance(torsion, float) and torsion:
-            extra = np.full(len(targets_mm), np.radians(torsion))
-            poses = with_torsion([scene.eye(side)], which, found, targets_mm - base - head_mm, extra)
+        poses = found.poses
+        if torsion_rad.any():
+            poses = with_torsion([scene.eye(side)], which, found, targets_mm - base - head_mm, torsion_rad)
         return poses.azimuth_rad, poses.elevation_rad
 
     return aim
@@ -339,15 +341,3 @@ def _stop(scene: TimedScene, side: str, diameter_mm: float) -> Stop:
     except InputError as error:
         raise InputError(f"a pupil of {diameter_mm:g} mm: {error.reason}", path="sequence.pupil") from None
     return stop if side == "right" else stop.mirrored()
-
-
-def single_stop(stops: Stop, row: int) -> Stop:
-    """Return one stop of a batch."""
-    return replace(
-        stops,
-        centre_mm=stops.centre_mm[row],
-        rotation=stops.rotation[row],
-        semi_axes_mm=stops.semi_axes_mm[row],
-        handed=stops.handed[row],
-        contour=stops.contour[row],
-    )

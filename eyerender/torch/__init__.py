@@ -1,6 +1,6 @@
 """Datasets for PyTorch: a folder of images, and a stream that renders its images while a network trains on them.
 
-This module needs PyTorch (the extra `torch`). `import eyerender` does not load it; write `import eyerender.torch`.
+This module needs PyTorch (the extra `torch`). `import eyerender` does not load it; the first use of `er.torch` does.
 
 Both datasets yield each image as a mapping with the requested parts, some of `PARTS`; docs/training.md has a table of
 them. Numbers that are unknown are nan. `valid` is a mapping from each label among the parts to bool tensors: one for an

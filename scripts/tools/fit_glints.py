@@ -33,7 +33,7 @@ from _weights import write_weights
 from extraction_tally import near
 from eyerender.extraction import ExtractionSettings, extract, pipeline
 from eyerender.extraction.glints.classification import LEAST_ODDS, classify_spots, compared, features
-from eyerender.extraction.glints.fits import SpotFit
+from eyerender.extraction.glints.fitting import SpotFit
 from eyerender.extraction.weights import glint_features
 from eyerender.optics.ellipse import Ellipse, iou
 

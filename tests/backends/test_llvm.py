@@ -19,13 +19,11 @@ from pathlib import Path
 import pytest
 
 import eyerender
-from eyerender.backends import apt as apt_module
-from eyerender.backends.apt import fetch_library
-from eyerender.backends.libraries import WHEEL, load_llvm, load_runtime, runtime_store
+from eyerender.backends import set_up as set_up_module
+from eyerender.backends.libraries import WHEEL, has_archive, llvm_command, load_llvm, load_runtime, runtime_store
 from eyerender.backends.llvm import ENVIRONMENT, VARIANT, candidates, find_llvm, version_of
 from eyerender.backends.probe import REFUSAL_AGE_S, Verdict, probe, run_probe
-from eyerender.backends.remedies import has_archive, llvm_command
-from eyerender.backends.set_up import setup_llvm
+from eyerender.backends.set_up import fetch_library, setup_llvm
 from eyerender.base.errors import BackendError
 from eyerender.base.storage.cachefolder import cache_folder
 
@@ -471,7 +469,7 @@ def point_apt_at(source: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     settings = folder / "machine.conf"
     settings.write_text(f'Dir::Etc::SourceList "{folder / "sources.list"}";\nDir::Etc::SourceParts "/dev/null";\n')
     monkeypatch.setenv("APT_CONFIG", str(settings))
-    monkeypatch.setattr(apt_module, "PAUSES_S", (0.0, 0.0))
+    monkeypatch.setattr(set_up_module, "PAUSES_S", (0.0, 0.0))
 
 
 @pytest.mark.packaging

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eyerender.apps.benchmark.conventions import OPENCV
 from eyerender.apps.benchmark.folder import load_labelled
 from eyerender.apps.benchmark.own import ellipse_of_mask
+from eyerender.apps.benchmark.protocol import OPENCV
 from eyerender.apps.benchmark.registry import defaults, names, resolve
 from eyerender.apps.benchmark.run import bench_extractors
 from eyerender.apps.benchmark.separate import cheshm_pupil, eight_bits, pupil_of

@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from eyerender.apps.benchmark.curves import curves_of
 from eyerender.apps.benchmark.folder import load_labelled
 from eyerender.apps.benchmark.protocol import Reply
 from eyerender.apps.benchmark.score import score
-from eyerender.apps.benchmark.summary import summarise
+from eyerender.apps.benchmark.summary import curves_of, summarise
 from eyerender.base.errors import InputError
 from eyerender.folders.imagefile import read_any_image, write_png
 from eyerender.optics.ellipse import Ellipse

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from eyerender.apps.benchmark.answers import ANSWERS
+from eyerender.apps.benchmark.asking import ANSWERS
 from eyerender.apps.benchmark.checks import Requirement, compare_with, problems_of
 from eyerender.apps.benchmark.folder import load_labelled
 from eyerender.apps.benchmark.intervals import mcnemar

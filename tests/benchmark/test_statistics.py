@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,19 +10,18 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
+import compare_ranks
 from eyerender.apps.benchmark.asking import ExtractorResults
-from eyerender.apps.benchmark.conventions import Conventions
-from eyerender.apps.benchmark.curves import curves_of
 from eyerender.apps.benchmark.failurekinds import kind_of
 from eyerender.apps.benchmark.glintlabels import TrueGlint
 from eyerender.apps.benchmark.intervals import subject_interval, wilson
 from eyerender.apps.benchmark.labelled import BenchImage
 from eyerender.apps.benchmark.paired import common_errors, pairs_of
-from eyerender.apps.benchmark.protocol import Greeting
+from eyerender.apps.benchmark.protocol import Conventions, Greeting
 from eyerender.apps.benchmark.registry import ExtractorCommand
 from eyerender.apps.benchmark.results import suggested_origin
 from eyerender.apps.benchmark.score import Outcome, Score
-from eyerender.apps.benchmark.summary import bins, summarise
+from eyerender.apps.benchmark.summary import bins, curves_of, summarise
 from eyerender.optics.ellipse import Ellipse
 
 
@@ -188,3 +188,43 @@ def test_half_a_pixel_suggests_the_other_origin(shift, declared, suggested):
     got = suggested_origin(ExtractorResults(ExtractorCommand("a", "a", ()), greeting, scores))
     assert (got and got["suggested"]) == suggested
     assert suggested_origin(ExtractorResults(ExtractorCommand("a", "a", ()), greeting, scores[:7])) is None
+
+
+def results(path, shares, images=40):
+    """A bench whose detectors have an IoU of 0.95 on a share of the images, and none on the others."""
+    entries = []
+    for name, share in shares.items():
+        hit = np.arange(images) < share * images
+        answers = [
+            {"image": f"{k}", "outcome": "right" if h else "none", "iou": 0.95 if h else None}
+            for k, h in enumerate(hit)
+        ]
+        answers.append({"image": "closed", "outcome": "absent", "iou": None})
+        entries.append({"name": name, "answers": answers})
+    path.write_text(json.dumps({"schema": "eyerender/bench-extractors/3", "extractors": entries, "image_digests": {}}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("second", "tau"),
+    [
+        pytest.param((0.2, 0.4, 0.9), 1.0, marks=pytest.mark.slow),
+        pytest.param((0.9, 0.4, 0.2), -1.0, marks=pytest.mark.slow),
+        ((0.2, 0.9, 0.4), 1 / 3),
+    ],
+)
+def test_tau_of_shares(tmp_path, monkeypatch, capsys, second, tau):
+    names = ("a", "b", "c")
+    paths = [
+        results(tmp_path / "first.json", {**dict(zip(names, (0.1, 0.5, 0.8), strict=True)), "own-fast": 1.0}),
+        results(tmp_path / "second.json", {**dict(zip(names, second, strict=True)), "own-fast": 0.0}),
+    ]
+    monkeypatch.setattr("sys.argv", ["compare_ranks.py", *map(str, paths), "--json"])
+    compare_ranks.main()
+    found = json.loads(capsys.readouterr().out)
+    assert found["detectors"] == list(names)
+    assert found["images"] == [40, 40]
+    for row in found["thresholds"]:
+        assert row["tau"] == pytest.approx(tau)
+        assert row["interval"][0] <= row["tau"] <= row["interval"][1]
+        assert row["shares"][1] == pytest.approx(second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import yaml
 
 import eyerender as er
 from eyerender.base.errors import InputError
+from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec
 from eyerender.scene import load_scene
@@ -82,6 +84,13 @@ def test_numbers_that_cut_clips_are_refused(change, message):
         spec(**change)
 
 
+def test_a_draw_that_would_change_within_a_clip_is_refused():
+    scene = spec().scene
+    lens = {"vignetting": {"draw": "uniform", "low": 0.0, "high": 0.5, "per": "sample"}}
+    with pytest.raises(InputError, match=r"lens\.vignetting\.per: would change within a clip; use clip"):
+        Plan.of(spec(scene={**scene, "lens": lens}))
+
+
 def test_the_length_of_clips_must_be_plain():
     scene = spec().to_mapping()["scene"]
     scene["sequence"]["duration_s"] = {"draw": "uniform", "low": 0.1, "high": 0.2}
@@ -135,3 +144,46 @@ def test_clips_of_a_loader_are_frames_in_a_row(made):
         clips.sampler(winks=2.0)
     with pytest.raises(InputError, match="has no clip of 9 frames"):
         ClipDataset(made / "out", frames=9)
+
+
+def _without_a_line(folder):
+    lines = (folder / "metadata.jsonl").read_text().splitlines(keepends=True)
+    (folder / "metadata.jsonl").write_text("".join(lines[:3] + lines[4:]))
+
+
+def _with_half_a_line(folder):
+    lines = (folder / "metadata.jsonl").read_text().splitlines(keepends=True)
+    (folder / "metadata.jsonl").write_text("".join([*lines[:3], lines[3][: len(lines[3]) // 2] + "\n", *lines[4:]]))
+
+
+def _with_half_a_picture(folder):
+    path = sorted((folder / "images").rglob("*.png"))[3]
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _without_a_picture(folder):
+    sorted((folder / "images").rglob("*.png"))[3].unlink()
+
+
+def _without_times(folder):
+    lines = [json.loads(line) for line in (folder / "metadata.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["records"][0]["time_s"] = None
+    (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+HARMS = (_without_a_line, _with_half_a_line, _without_times, _with_half_a_picture, _without_a_picture)
+
+
+@pytest.mark.parametrize("layout", ["video", "bids"])
+@pytest.mark.parametrize("harm", HARMS)
+def test_an_export_of_a_harmed_folder_says_so_in_one_line_and_leaves_nothing(made, tmp_path, capsys, layout, harm):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(made / "out", folder)
+    harm(folder)
+    code = run(["export-dataset", str(folder), str(out), "--format", layout])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert code == 2
+    assert [line for line in said if line.startswith("error: ")] == said[-1:]
+    assert "Traceback" not in "".join(said)
+    assert not out.exists() or not any(out.iterdir())

@@ -78,10 +78,7 @@ def test_choices_keep_their_weights():
 
 
 def test_grids_form_their_full_product():
-    tree = {
-        "b": {"draw": "grid", "low": 0, "high": 1, "steps": 3},
-        "a": {"draw": "grid", "values": ["x", "y"]},
-    }
+    tree = {"b": {"draw": "grid", "low": 0, "high": 1, "steps": 3}, "a": {"draw": "grid", "values": ["x", "y"]}}
     made = template(tree)
     seen = [
         tuple(made.values(Turn(sample=i, subject=0, sequence=0, attempt=0, subject_attempt=0))[1].values())

@@ -397,11 +397,7 @@ def test_hugging_face_reads_one_split_by_its_column(tiny, tmp_path, monkeypatch)
     subjects = {}
     for name, count in SPLITS.items():
         rows = datasets.load_dataset(
-            "imagefolder",
-            data_dir=str(tiny),
-            cache_dir=str(tmp_path),
-            split="train",
-            filters=[("split", "==", name)],
+            "imagefolder", data_dir=str(tiny), cache_dir=str(tmp_path), split="train", filters=[("split", "==", name)]
         )
         assert rows["split"][:] == [name] * count
         assert np.asarray(rows[0]["image"]).shape == (72, 96)

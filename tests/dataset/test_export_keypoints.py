@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from skimage.draw import polygon2mask
 from eyerender.dataset.export import export
 from eyerender.dataset.export.item import Item
 from eyerender.dataset.export.keypoints import box, keypoints, mirrored_order, names
-from eyerender.dataset.export.yolo import _pose, polygons
+from eyerender.dataset.export.yolo import _pose, joined, polygons
 from eyerender.folders.imagefile import read_image
 from eyerender.folders.imagefolder import ImageEntry, ImageFolder
 
@@ -107,18 +108,24 @@ def test_polygons_enclose_the_pixels_of_each_part():
     inside[2, 70] = True  # a speck
     found = polygons(inside)
     assert len(found) == 2
-    again = np.zeros_like(inside)
-    for polygon in found:
-        again |= polygon2mask(inside.shape, polygon[:, ::-1])
     inside[24:27, 29:32], inside[2, 70] = True, False
-    assert np.count_nonzero(again & inside) / np.count_nonzero(again | inside) > 0.97
+    apart = sum(polygon2mask(inside.shape, polygon[:, ::-1]) for polygon in found)
+    for again in (apart > 0, polygon2mask(inside.shape, joined(found)[:, ::-1])):
+        assert np.count_nonzero(again & inside) / np.count_nonzero(again | inside) > 0.97
+    # A bridge goes out and back, so it adds no area.
+    x, y = joined(found).T
+    areas = [abs(np.dot(p[:, 0], np.roll(p[:, 1], -1)) - np.dot(p[:, 1], np.roll(p[:, 0], -1))) for p in found]
+    assert abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) == pytest.approx(sum(areas))
 
 
 @pytest.mark.render
 def test_coco_has_keypoints_of_the_eye(tiny, tmp_path):
     from pycocotools import coco
 
-    export(tiny, "coco", tmp_path / "out")
+    folder = shutil.copytree(tiny, tmp_path / "licensed")
+    about = json.loads((folder / "dataset.json").read_text())
+    (folder / "dataset.json").write_text(json.dumps(about | {"spec": about["spec"] | {"licence": "CC0-1.0"}}))
+    export(folder, "coco", tmp_path / "out")
     lines = {entry.path.stem: entry.line for entry in ImageFolder.load(tiny).entries}
     seen = 0
     for path in sorted((tmp_path / "out" / "annotations").glob("keypoints_*.json")):
@@ -137,6 +144,7 @@ def test_coco_has_keypoints_of_the_eye(tiny, tmp_path):
             x, y, w, h = mark["bbox"]  # in the corners of masks
             assert (x, y, x + w, y + h) == (u.min(), v.min(), u.max() + 1, v.max() + 1)
             assert (image["camera"], image["camera_name"]) == (0, "camera")
+            assert [one["name"] for one in data.dataset["licenses"] if one["id"] == image["license"]] == ["CC0-1.0"]
             seen += 1
         assert precision(path, "keypoints") == pytest.approx(1)
     assert seen == 24

@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 
 import numpy as np
 import pytest
@@ -69,6 +70,7 @@ def test_a_dry_run_states_shards_of_a_stated_size(argv, shards):
     assert more_cpu_s <= 2.0 * cpu_s
 
 
+@cache
 def _dry_run(*argv):
     """Return the number of shards and the CPU seconds."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -1,4 +1,4 @@
-"""Samples as pure functions of (spec, i); subjects, splits, and the rule of drawing again."""
+"""Samples as pure functions of (spec, i); subjects, splits, interleaving, and the rule of drawing again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eyerender.base.errors import InputError
 from eyerender.dataset.draws import unit_number
 from eyerender.dataset.plan import RANKED_SUBJECTS, Plan
 from eyerender.dataset.realise import frames_of, realise
-from eyerender.dataset.selection import Selection, in_spread_order
+from eyerender.dataset.selection import Selection, in_spread_order, scrambled
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
 from eyerender.eye.catalogue import load_eye
 from eyerender.scene.spec import SceneSpec
@@ -140,10 +140,7 @@ def test_another_eye_takes_the_place_of_the_specs_own(tmp_path, monkeypatch):
 
 
 def test_blinks_pass_and_lids_stay_also_inside_a_choice():
-    lids = {
-        "seed": {"draw": "integer", "low": 1, "high": 10**6},
-        "blink": {"draw": "uniform", "low": 0.0, "high": 0.5},
-    }
+    lids = {"seed": {"draw": "integer", "low": 1, "high": 10**6}, "blink": {"draw": "uniform", "low": 0.0, "high": 0.5}}
     made = plan(scene__region={"draw": "choice", "values": [None, lids]})
     regions = defaultdict(list)
     for i in range(24):
@@ -225,10 +222,7 @@ def test_splits_part_the_subjects_by_their_shares():
 def test_a_sample_that_cannot_be_made_is_drawn_again():
     # Half of the targets lie behind the head, where no eye can look.
     made = plan(
-        **{
-            "scene.targets": {"world_mm": [[{"draw": "uniform", "low": -600, "high": 600}, 0, 0]]},
-            "attempts": 40,
-        }
+        **{"scene.targets": {"world_mm": [[{"draw": "uniform", "low": -600, "high": 600}, 0, 0]]}, "attempts": 40}
     )
     rejected = 0
     for i in range(24):
@@ -278,13 +272,7 @@ def test_pupils_must_lie_in_the_window_unless_not_required():
 
 
 def test_eyes_of_several_models():
-    made = plan(
-        **{
-            "scene.eye.model": {"draw": "choice", "values": ["E1", "E2", "E5"]},
-            "count": 40,
-            "subjects": 40,
-        }
-    )
+    made = plan(**{"scene.eye.model": {"draw": "choice", "values": ["E1", "E2", "E5"]}, "count": 40, "subjects": 40})
     models = set()
     for i in range(40):
         sample = made.draw(i)
@@ -325,3 +313,48 @@ def test_a_scene_that_is_drawn_as_a_number_is_an_error(name):
     spec = DatasetSpec.from_mapping({**Plan.load(name).spec.to_mapping(), "scene": drawn})
     with pytest.raises(InputError, match="scene: must be a mapping"):
         Plan.of(spec).draw(0)
+
+
+@pytest.mark.parametrize(
+    ("planned", "subjects", "size", "count"),
+    [
+        pytest.param(1000, 70, 100, 1000, id="even"),
+        pytest.param(1003, 70, 97, 1003, id="uneven"),
+        pytest.param(1003, 70, 97, 2300, id="grown"),
+        pytest.param(1003, 70, 97, 333, id="spread"),
+        pytest.param(50, 3, 64, 50, id="one-shard"),
+        pytest.param(24, 24, 3, 30, id="a-subject-per-sample"),
+    ],
+)
+def test_every_sample_is_in_one_shard(planned, subjects, size, count):
+    spread = count % planned > 0
+    own = {"planned": planned, "subjects": subjects, "shard_size": size}
+    selection = Selection(count=count, spread=spread, interleave=5, **own)
+    by_shard = {shard: selection.shard_samples(shard) for shard in selection.shards}
+    assert sorted(k for samples in by_shard.values() for k in samples) == sorted(selection.samples)
+    assert all(len(samples) <= size for samples in by_shard.values())
+    assert all(selection.shard_of(k) == shard for shard, samples in by_shard.items() for k in samples)
+    # A sample stays in its shard when the dataset grows.
+    more = Selection(count=3 * planned, spread=False, interleave=5, **own)
+    assert all(more.shard_of(k) == shard for shard, samples in by_shard.items() for k in samples)
+
+
+def test_a_shard_of_a_thousand_has_fifty_subjects_and_runs_of_neighbours():
+    selection = Selection(count=500_000, planned=500_000, subjects=1000, shard_size=1000, spread=False, interleave=1)
+    for shard in (0, 17, 499):
+        samples = np.array(selection.shard_samples(shard))
+        assert len({selection.subject_of(int(k)) for k in samples}) >= 50
+        assert np.count_nonzero(np.diff(samples) == 1) >= 800  # the last shards hold what is left of each subject
+
+
+def test_hashes_are_those_of_splitmix64():
+    """Published values of the reference implementation for the seed 1234567 (Vigna)."""
+    published = [6457827717110365317, 3203168211198807973, 9817491932198370423]
+    assert scrambled(np.arange(1, 4), 1234567).tolist() == published
+
+
+def test_shards_have_their_size_across_the_blocks_of_a_plan():
+    selection = Selection(count=12_160, planned=3_040, subjects=152, shard_size=1000, spread=False, interleave=1)
+    sizes = [len(selection.shard_samples(shard)) for shard in selection.shards]
+    assert sizes == [1000] * 12 + [160]
+    assert sizes == [selection.shard_count(shard) for shard in selection.shards]

@@ -18,6 +18,7 @@ from eyerender.scene import Scene, is_dataset, load_scene, shipped_files, shippe
 from eyerender.scene.spec import SceneSpec
 from tests.support.dataset_specs import make
 from tests.support.in_process import single_workers_in_process
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 pytestmark = pytest.mark.render
 
@@ -71,7 +72,7 @@ def test_it_validates_once_it_is_made(name, tmp_path):
 @pytest.mark.parametrize("eye", ["E5", pytest.param("E3", marks=pytest.mark.slow)])
 def test_eyes_seen_from_the_side_validate(eye, tmp_path):
     """The outlines hold for tilted and biconic corneas too, up to where rays just miss the rim."""
-    data = load_scene("head_mounted", spp=1).spec.to_mapping()
+    data = load_scene(BARE_HEAD_MOUNTED, spp=1).spec.to_mapping()
     data["eye"] = {"model": eye, "pupil_diameter_mm": 6.0}
     del data["targets"]
     data["poses"] = [{"azimuth_deg": -35, "elevation_deg": -25}, {"azimuth_deg": 35, "elevation_deg": -25}]

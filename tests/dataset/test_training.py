@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.dataset.training.augment import Augmentation
-from eyerender.dataset.training.item import LABELS, person_names
+from eyerender.dataset.training.item import LABELS, partners, person_names, rig_pose
 from eyerender.dataset.training.place import Placement, placed
 from eyerender.dataset.training.prepare import Preparation, lamps_vary
-from eyerender.dataset.training.symmetry import partners, rig_pose
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.labels import labels_of

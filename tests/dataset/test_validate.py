@@ -8,19 +8,19 @@ import shutil
 
 import numpy as np
 import pytest
+import yaml
 
-from eyerender.analytic.observer import trace
 from eyerender.apps.inspection import inspect
 from eyerender.base.errors import InputError, UnfinishedRunWarning
 from eyerender.cli.main import run
 from eyerender.dataset.export import export
+from eyerender.dataset.spec import shipped_datasets
 from eyerender.dataset.validate import validate
-from eyerender.dataset.validation.truth import SceneTruth
-from eyerender.folders.imagefile import read_image, write_png
-from eyerender.imaging.labels import EyeInWindow, known_labels
-from eyerender.imaging.lines import image_line
+from eyerender.folders.imagefile import picture_bytes, read_image, write_png
+from eyerender.folders.imagefolder import ImageFolder
 from eyerender.scene import load_scene
 from tests.support.dataset_specs import mapping
+from tests.support.in_process import single_workers_in_process
 from tests.support.stages import unassemble
 
 pytestmark = pytest.mark.render
@@ -175,17 +175,30 @@ def test_what_is_no_dataset_is_refused(copy, tmp_path):
         validate(tmp_path / "nowhere")
 
 
-def test_lines_of_a_rendered_folder_are_computed_again():
-    scene = load_scene("guestrin2006")
-    observed = trace(scene)
-    truth = SceneTruth(scene.frames(), observed)
-    view = EyeInWindow.of(scene.frames(), 0)
-    (record,) = observed.take([0]).records()
-    labels = known_labels(scene, observed, view)
-    labels["glints"] = [{**glint, "spot_xy_px": None, "hidden_by": "visible"} for glint in labels["glints"]]
-    line = image_line(scene, record, view.window, {**labels, "lid_margins_px": None})
-    assert truth.again(line).problems == ()
-    line["records"][0]["pupil"]["points_px"][3][0] += 0.01
-    assert any("points_px" in problem for problem in truth.again(line).problems)
-    line["labels"]["space"]["world"]["cornea_centre_mm"][0] += 0.01
-    assert any("cornea_centre_mm" in problem for problem in truth.again(line).problems)
+def written(path, name):
+    """A dataset file of two images with all labels of geometry, after a shipped dataset or scene."""
+    if name in shipped_datasets():
+        data = yaml.safe_load(shipped_datasets()[name].read_text(encoding="utf-8"))
+    else:
+        data = {"format": 3, "kind": "dataset", "name": name, "count": 2, "scene": load_scene(name).spec.to_mapping()}
+        data["scene"]["targets"] = {"world_mm": [[1000.0, 300.0, 200.0]]}
+    data["labels"] = {**data.get("labels", {}), "geometry": ["depth", "normals", "iris_coordinates", "instances"]}
+    data["scene"].setdefault("image", {}).update(spp=1)
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize("name", ["headset", "people_openeds"])
+def test_normals_are_judged_against_their_own_rays(tmp_path, capsys, name):
+    folder = tmp_path / "out"
+    made = ["generate", written(tmp_path / "d.yaml", name), "-o", str(folder), "--workers", "1", "--count", "2"]
+    with single_workers_in_process():
+        assert run(made) == 0
+    assert run(["validate", str(folder)]) == 0, capsys.readouterr().out
+    entry = ImageFolder.load(folder).entries[0]
+    normals = entry.normals()
+    turned = np.where(np.isnan(normals[..., 2:]), normals, -normals)
+    (folder / entry.line["normals_file_name"]).write_bytes(picture_bytes(turned))
+    capsys.readouterr()
+    assert run(["validate", str(folder)]) == 1
+    assert "its normals are no unit vectors to the camera" in capsys.readouterr().out

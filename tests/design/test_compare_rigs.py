@@ -11,13 +11,14 @@ import eyerender as er
 from eyerender.apps.rigs.compare import compare_rigs, interval
 from eyerender.apps.rigs.options import RigSize
 from eyerender.cli.main import run
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 SIZE = RigSize(people=4, sample=1, workers=1)
 
 
 @pytest.fixture(scope="module")
 def headset():
-    return er.load_scene("head_mounted")
+    return er.load_scene(BARE_HEAD_MOUNTED)
 
 
 def dimmed(scene, factor):

@@ -15,12 +15,23 @@ from eyerender.base.errors import FitWarning
 from eyerender.cli.main import run
 from eyerender.design.eyefile import changed_file
 from eyerender.design.features import MODEL_PX, measured, outline_distances, residuals
-from eyerender.design.fit import Options, equations_of, fit_eye, instants_of, problem_of, solve, weights_of
-from eyerender.design.information import arrow_inverse, case_of, eye_information, outline_normals
+from eyerender.design.fit import (
+    Options,
+    costs_of,
+    equations_of,
+    fit_eye,
+    instants_of,
+    marginal_step,
+    problem_of,
+    solve,
+    weights_of,
+)
+from eyerender.design.information import arrow_inverse, case_of, eye_information, outline_normals, roots_of
 from eyerender.design.noise import FeatureNoise
 from eyerender.design.unknowns import (
     CENTRE,
     COUNT,
+    DEPTH,
     ELLIPTICITY,
     GAP,
     KAPPA,
@@ -30,6 +41,7 @@ from eyerender.design.unknowns import (
     POSTERIOR,
     POSTERIOR_TORICITY,
     PUPIL,
+    RADIUS,
     SHIFT,
     TORICITY,
     Unknowns,
@@ -37,14 +49,15 @@ from eyerender.design.unknowns import (
 from eyerender.design.varied import images_of, lines_of_sight, radius_of, slopes_of
 from eyerender.gaze.estimate import angular_error_deg
 from eyerender.optics.transforms import direction_of
+from tests.support.paths import BARE_HEAD_MOUNTED
 
-RIGS = ("head_mounted", "guestrin2006", "blignaut2014")
+RIGS = (BARE_HEAD_MOUNTED, "guestrin2006", "blignaut2014")
 EYES = ("E1", "E2", "E3", "E4", "E5")
 
 
 def frames_of(name, eye="E2", most=9):
     scene = er.Scene.of(er.load_scene(name).spec, eye=eye)
-    if name == "head_mounted":
+    if name == BARE_HEAD_MOUNTED:
         scene = scene.with_(gaze_deg=[(azimuth, elevation) for elevation in (12, 0, -12) for azimuth in (15, 0, -15)])
     frames = scene.frames()
     rows = np.flatnonzero((frames.index.eye == frames.index.eye.min()) & (frames.index.head == 0))
@@ -230,7 +243,7 @@ def test_chi_square_of_fits_of_a_person_over_many_frames(rig):
 @pytest.mark.parametrize("what", ["glints", "outlines"])
 def test_wrong_features_hardly_matter(what):
     """10 % of the glints, or of the outlines, are wrong by many pixels: error at most 1.5 times as large."""
-    frames = frames_of("head_mounted")
+    frames = frames_of(BARE_HEAD_MOUNTED)
     frames = frames.take(np.tile(np.arange(9), 5))
     noise = FeatureNoise.of(0.07, 0.0085, rig=frames.scene.rig)
     rng = np.random.default_rng(8)
@@ -275,7 +288,7 @@ def test_distances_from_an_outline():
 
 def test_an_ellipse_with_a_covariance_weighs_as_it_says():
     """Whitened distances of a slightly other ellipse are those of its parameters, d^T C^-1 d with `MODEL_PX` in C."""
-    frames = frames_of("head_mounted", most=1)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=1)
     seen = er.trace(frames)
     rng = np.random.default_rng(2)
     root = rng.normal(size=(5, 5)) * 0.05
@@ -297,7 +310,7 @@ def test_an_ellipse_with_a_covariance_weighs_as_it_says():
 @pytest.mark.parametrize("off", [0.08, 5.0])
 def test_outlines_that_are_off_by_more_than_their_noise_count_and_wrong_ones_do_not(off):
     """As an extractor gives them: a noise of .008 px is stated, and every fourth outline is longer and narrower."""
-    frames = frames_of("head_mounted")
+    frames = frames_of(BARE_HEAD_MOUNTED)
     seen = er.trace(frames)
     longer = np.arange(len(seen)) % 4 == 1
     bent = replace(
@@ -335,7 +348,7 @@ def test_centres_of_pupils_alone_give_the_gaze_too(rig):
 
 def test_the_eye_file_is_the_eye_that_was_fitted():
     """A file with changed numbers, built, has the features and the line of sight of the unknowns that made it."""
-    frames = frames_of("head_mounted", most=3)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=3)
     case, _ = case_of(frames)
     theta = case.theta.copy()
     theta[:, 6:12] = [0.2, 0.04, 0.1, np.radians(1.5), np.radians(-1.0), 0.3]
@@ -479,6 +492,55 @@ def test_an_eye_that_cannot_be_or_is_far_from_its_priors_is_refused(tmp_path, ca
     assert fit.known.axis_deg.mean() > 1.3 * calm.known.axis_deg.mean()
 
 
+def test_the_person_is_the_most_probable_one_with_frames_integrated_out():
+    """The step from the joint mode is Newton's on the marginal posterior, which quadrature gives (Gauss, Hermite)."""
+    frames = frames_of("head_mounted", most=4)
+    seen = er.trace(frames)
+    moved = replace(seen.index, eye_position_mm=seen.index.eye_position_mm + np.array([2.0, 1.0, -3.0]))
+    unknowns = Unknowns(gaze_deg="known", slippage_mm=3.0, corneal_radius_mm=0.5, pupil_depth_mm=0.5)
+    made = FeatureNoise.of(0.1, 0.05, rig=frames.scene.rig), Options(targets=False, robust="none")
+    problem = problem_of(replace(seen, index=moved), frames.scene.rig, frames.scene.eye_spec, unknowns, *made)
+    problem.centre[:, :2] = np.stack([seen.pose.azimuth_rad, seen.pose.elevation_rad], axis=1)
+    joint, _ = solve(problem, problem.centre)
+    nodes, shares = np.polynomial.hermite_e.hermegauss(3)
+    alone = replace(problem, free=problem.free & (np.arange(COUNT) < LOCAL))
+    local, person = np.flatnonzero(alone.free), [RADIUS, DEPTH]
+
+    def found(theta, features=images_of):
+        return residuals(problem.seen, features(problem.views, theta, 30))
+
+    def state(theta):
+        weights = weights_of(problem, found(theta))
+        return weights, equations_of(problem, theta, found(theta, slopes_of), weights)[0]
+
+    def marginal(shift):
+        """Half the negative logarithm of the posterior of the person."""
+        start = joint.copy()
+        start[:, person] += shift
+        best, _ = solve(alone, start)
+        weights, matrix = state(best)
+        root = roots_of(matrix[:, local[:, None], local] + np.diag(problem.precision[local]))
+        (least, prior), total = costs_of(problem, best, found(best), weights), np.zeros(len(best))
+        for which in np.ndindex(*(len(nodes),) * len(local)):
+            z, theta = nodes[list(which)], best.copy()
+            theta[:, local] += root @ z
+            cost = costs_of(problem, theta, found(theta), weights)[0]
+            total += np.prod(shares[list(which)]) * np.exp((least - cost + z @ z) / 2.0)
+        return (least.sum() + prior) / 2.0 - (np.log(total) + np.linalg.slogdet(root)[1]).sum()
+
+    matrix = state(joint)[1]
+    known = eye_information(
+        "right", (frames.index.fixation, frames.index.head), matrix, np.zeros((4, 2, COUNT)), unknowns
+    )
+    at, width = np.array(person) - LOCAL, 0.1
+    axes = np.linalg.cholesky(known.person_covariance[np.ix_(at, at)])
+    slope = [(marginal(width * axis) - marginal(-width * axis)) / (2.0 * width) for axis in axes.T]
+    wanted = -axes @ slope
+    step = marginal_step(problem, joint)[0, person]
+    assert (np.abs(step) > 0.05 * known.person_deviation[at]).all()
+    np.testing.assert_allclose(step, wanted, rtol=0.01)
+
+
 def test_a_frame_that_no_eye_explains_has_no_gaze():
     """A displacement of 25 mm where 1 mm is the prior's deviation."""
     frames = frames_of("guestrin2006", most=4)
@@ -507,7 +569,7 @@ def test_a_calibration_finds_kappa():
 
 
 def test_instants_join_cameras_but_not_repeats():
-    frames = frames_of("head_mounted", most=2)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=2)
     seen = er.trace(frames.take([0, 1, 0, 1]))
     assert sorted(instants_of(seen).tolist()) == [0, 1, 2, 3]
     both = replace(seen, index=replace(seen.index, camera=np.array([0, 0, 1, 1])))
@@ -557,7 +619,7 @@ def test_what_is_kept_of_many_instants_grows_with_their_number():
 
 
 def test_what_cannot_be_fitted_is_named():
-    frames = frames_of("head_mounted", most=2)
+    frames = frames_of(BARE_HEAD_MOUNTED, most=2)
     seen = er.trace(frames)
     lost = replace(seen, index=replace(seen.index, eye_position_mm=np.full((2, 3), np.nan)))
     with pytest.raises(er.InputError, match="eye_position_mm: is needed, at least roughly"):

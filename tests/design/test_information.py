@@ -28,11 +28,12 @@ from eyerender.eye.build import bare_eye, fitting_stop
 from eyerender.eye.parts import EyeParts
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.optics.transforms import direction_of
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return er.load_scene("head_mounted")
+    return er.load_scene(BARE_HEAD_MOUNTED)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,7 @@ def test_without_features_the_prior_remains(scene):
 @pytest.mark.parametrize("eye", ["E2", "E5", *(pytest.param(e, marks=pytest.mark.slow) for e in ("E1", "E4"))])
 def test_derivatives_are_those_of_rebuilt_eyes(eye):
     """Richardson's extrapolation over eyes that are built from changed files, and placed and turned anew."""
-    scene = er.Scene.of(er.load_scene("head_mounted").spec, eye=eye)
+    scene = er.Scene.of(er.load_scene(BARE_HEAD_MOUNTED).spec, eye=eye)
     case, _ = case_of(scene.frames().take([0, 5]))
     slopes = slopes_of(case.views, case.theta, 12)
     for column, name in enumerate(NAMES[: TORICITY.start]):

@@ -17,21 +17,22 @@ from eyerender.design.lids import inside_polygon
 from eyerender.design.noise import sensor_noise
 from eyerender.design.people import GRID, RigPopulation, figures_of, people_of
 from eyerender.design.unknowns import Unknowns
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 
 @pytest.fixture(scope="module")
 def survey():
-    scene = er.load_scene("head_mounted").spec.to_mapping()
+    scene = er.load_scene(BARE_HEAD_MOUNTED).spec.to_mapping()
     people = er.Population("adults").to_mapping()
     return RigPopulation(scene=scene, population=people, unknowns=Unknowns.population().to_mapping(), lids=False)
 
 
 def test_the_noise_of_a_frame_is_that_of_information(survey):
     """The same person as a scene of its own, with the person known: `er.information` of one frame."""
-    noise = sensor_noise(er.load_scene("head_mounted"))
+    noise = sensor_noise(er.load_scene(BARE_HEAD_MOUNTED))
     found = figures_of(survey, noise, 3, 1)
     (someone,), _ = people_of(survey, 3, 1)
-    spec = er.load_scene("head_mounted").spec
+    spec = er.load_scene(BARE_HEAD_MOUNTED).spec
     person = er.Population("adults").person(3, 0)
     subject = er.Subject.of(
         person,
@@ -49,7 +50,7 @@ def test_the_noise_of_a_frame_is_that_of_information(survey):
 
 
 def test_people_do_not_depend_on_their_pieces(survey):
-    noise = sensor_noise(er.load_scene("head_mounted"))
+    noise = sensor_noise(er.load_scene(BARE_HEAD_MOUNTED))
     whole = figures_of(survey, noise, 0, 2)
     alone = figures_of(survey, noise, 1, 1)
     assert alone.fixating_deg[0] == pytest.approx(whole.fixating_deg[1], rel=1e-9)
@@ -65,7 +66,7 @@ def test_lids_hide_features_when_they_close(survey, monkeypatch):
     """Half-closed lids hide a part of the outlines; closed ones hide everything."""
     from eyerender.design import people
 
-    noise, real = sensor_noise(er.load_scene("head_mounted")), people.people_of
+    noise, real = sensor_noise(er.load_scene(BARE_HEAD_MOUNTED)), people.people_of
     data = {**{name: getattr(survey, name) for name in RigPopulation.__slots__}, "lids": True}
 
     def blinking(amount):

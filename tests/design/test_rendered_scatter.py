@@ -13,6 +13,7 @@ from eyerender.design.information import outline_normals
 from eyerender.design.noise import read_noise_e, sensor_noise
 from eyerender.imaging.capture import render_windows
 from eyerender.rig.exposure import electrons, recorded
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 DRAWS = 100
 DRAWN = (0.71, 0.93)
@@ -40,7 +41,7 @@ def test_the_scatter_of_the_extractor_is_that_of_the_bound_over_its_efficiency()
         for a in (0.2, 1.8, 3.4)
     ]  # fmt: skip
     changes = {"rig.lights": lights, "image.window_px": [200, 200], "sensor.read_noise_e": 300.0}
-    scene = er.load_scene("head_mounted").with_(changes)
+    scene = er.load_scene(BARE_HEAD_MOUNTED).with_(changes)
     frames = scene.frames().take([4])
     (image,) = render_windows(frames, backend="llvm")
     sensor, camera, nm = scene.spec.sensor, scene.rig.cameras[0], scene.spec.wavelength_nm

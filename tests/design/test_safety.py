@@ -9,6 +9,7 @@ import pytest
 
 import eyerender as er
 from eyerender.design.safety import eye_exposure
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 
 def rig(*lights):
@@ -66,7 +67,7 @@ def test_other_wavelengths_weigh_less():
 
 def test_a_duty_cycle_does_not_change_what_a_scene_is_called():
     """Scenes without the key keep the digest that runs and caches know them by."""
-    scene = er.load_scene("head_mounted").spec
+    scene = er.load_scene(BARE_HEAD_MOUNTED).spec
     assert "duty_cycle" not in scene.to_mapping()["rig"]["lights"][0]
     with pytest.raises(er.InputError, match="duty_cycle"):
         rig({"position_mm": [50, 0, 0], "duty_cycle": 1.5})

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 import make_ideal_images as ideal
 from eyerender.extraction import FAST, extract
 from eyerender.extraction.pupil.glare import inpaint_glints
+from eyerender.extraction.statistics import median, quantile
 from eyerender.optics.ellipse import Ellipse, iou
 
 
@@ -70,3 +73,16 @@ def test_a_saturated_bar_is_one_glint():
     assert glint.saturated
     assert np.hypot(*(glint.xy_px - middle)) < 1.0
     assert iou(found.pupil.ellipse, truth) > 0.97
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
+@pytest.mark.parametrize("size", [1, 2, 3, 10, 101, 1000])
+def test_as_numpy_has_them(size, dtype):
+    values = (np.random.default_rng(size).normal(100.0, 20.0, size)).astype(dtype)
+    assert median(values) == pytest.approx(float(np.median(values)), rel=1e-6)
+    for share in (0.0, 0.03, 0.25, 0.9, 1.0):
+        assert quantile(values, share) == pytest.approx(float(np.quantile(values, share)), rel=1e-5)
+
+
+def test_of_none_is_not_a_number():
+    assert math.isnan(median(np.zeros(0)))

@@ -16,7 +16,7 @@ from eyerender.eye.catalogue import FOLDER, catalogue_files, catalogue_names, lo
 from eyerender.eye.parts import GradientLensSpec
 from eyerender.eye.pose import Poses, rigid_motion
 from eyerender.eye.spec import EyeSpec
-from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_graph import Biconic
 from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import trace
 

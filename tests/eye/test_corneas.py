@@ -22,15 +22,7 @@ from eyerender.eye.pose import Poses
 from eyerender.eye.topography import read_topography
 from eyerender.optics.solve import apparent_points
 from eyerender.rig.camera import PinholeCamera
-from tests.support.corneas import (
-    GOLDEN,
-    conic_depth,
-    eye_with,
-    grid_of,
-    keratoconus,
-    measured_shapes,
-    zernike_of,
-)
+from tests.support.corneas import GOLDEN, conic_depth, eye_with, grid_of, keratoconus, measured_shapes, zernike_of
 from tests.support.eye_meshes import crossing
 from tests.support.mirror import mirror_points
 

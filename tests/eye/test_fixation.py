@@ -1,19 +1,22 @@
-"""Fixation: both readings of the line of sight, against another program's poses and against their definitions."""
+"""Fixation: both readings of the line of sight, poses and torsion, against another program's poses and definitions."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
+import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.base.status import Status
 from eyerender.eye.batch import stack_eyes
 from eyerender.eye.catalogue import catalogue_names, load_eye
 from eyerender.eye.fixation import RESIDUAL_LIMIT_MM, entrance_window_centre, fixate
 from eyerender.eye.landmarks import field_direction, incident_node, nodal_rays, path_to_retina
-from eyerender.eye.pose import Poses, Turning, into_eye, rigid_motion
+from eyerender.eye.pose import Poses, Turning, into_eye, listing_torsion, rigid_motion
 from eyerender.eye.spec import EyeSpec
+from eyerender.imaging.labels import space_labels
 from eyerender.optics.surfaces import components, join
 from eyerender.optics.trace import trace
 from tests.support.paths import load
@@ -232,3 +235,94 @@ def test_a_fovea_may_be_given():
     found = fixate(eye, [[500.0, 0.0, 0.0]])
     assert np.allclose([found.poses.azimuth_rad, found.poses.elevation_rad], 0.0, atol=1e-15)
     assert Poses.from_degrees(0.0, 0.0) == Poses.from_degrees([0.0], [0.0])
+
+
+def poses(seed=0, count=100):
+    rng = np.random.default_rng(seed)
+    return Poses.from_degrees(rng.uniform(-50, 50, count), rng.uniform(-40, 40, count))
+
+
+def test_listing_makes_the_shortest_rotation_to_the_gaze():
+    """Torsion-free: the rotation vector is across both +x and the gaze."""
+    turned, _ = rigid_motion(poses(), load_eye("E2").build())
+    axis = Rotation.from_matrix(turned).as_rotvec()
+    assert np.abs(axis[:, 0]).max() < 1e-14
+    assert np.abs(np.sum(axis * turned[:, :, 0], axis=1)).max() < 1e-14
+
+
+def test_azimuth_turns_left_and_elevation_up():
+    turned, _ = rigid_motion(Poses.from_degrees([10.0, 0.0], [0.0, 10.0]), load_eye("E2").build())
+    assert np.allclose(turned[0, :, 0], [np.cos(np.radians(10)), np.sin(np.radians(10)), 0.0])
+    assert np.allclose(turned[1, :, 0], [np.cos(np.radians(10)), 0.0, np.sin(np.radians(10))])
+
+
+def test_torsions_agree_with_the_reference():
+    data = load("projection_E2.json")
+    for record in data["records"]:
+        azimuth, elevation = np.radians(record["pose_azi_ele"])
+        assert abs(np.degrees(listing_torsion(azimuth, elevation)) - record["pseudo_torsion"]) < 1e-12
+
+
+def test_each_axis_turns_about_its_own_centre():
+    eye, pose = load_eye("E5").build(), poses(1)
+    matrix, shift = rigid_motion(pose, eye)
+    points = np.random.default_rng(2).normal(size=(len(pose), 3)) * 10.0
+    moved = np.einsum("nij,nj->ni", matrix, points) + shift
+    for k in range(len(pose)):
+        p = points[k]
+        for letter, angle, centre in (
+            ("x", pose.torsion_rad[k], eye.rotation.torsion_centre_mm),
+            ("y", -pose.elevation_rad[k], eye.rotation.elevation_centre_mm),
+            ("z", pose.azimuth_rad[k], eye.rotation.azimuth_centre_mm),
+        ):
+            p = Rotation.from_euler(letter, angle).as_matrix() @ (p - centre) + centre
+        assert np.allclose(p, moved[k], atol=1e-13)
+
+
+def test_into_eye_undoes_the_motion():
+    eye, pose = load_eye("E5").build(), poses(3)
+    matrix, shift = rigid_motion(pose, eye)
+    points = np.random.default_rng(4).normal(size=(len(pose), 3)) * 300.0
+    moved = np.einsum("nij,nj->ni", matrix, points) + shift
+    assert np.allclose(join(into_eye(Turning.of(pose), eye, components(moved))), points, atol=1e-11)
+
+
+def test_a_batch_of_eyes_moves_as_its_members():
+    eyes, pose = [load_eye(n).build(eye=s) for n in ("E2", "E1") for s in ("right", "left")], poses(5, 4)
+    matrix, shift = rigid_motion(pose, stack_eyes(eyes))
+    for k, eye in enumerate(eyes):
+        one = Poses(pose.azimuth_rad[k], pose.elevation_rad[k], pose.torsion_rad[k])
+        alone = rigid_motion(one, eye)
+        assert np.allclose(matrix[k], alone[0][0], atol=1e-15)
+        assert np.allclose(shift[k], alone[1][0], atol=1e-14)
+
+
+TARGETS = [[600.0, 30.0, 20.0], [300.0, -50.0, 0.0]]
+
+
+@pytest.mark.parametrize("name", ["headset", "eyelink_desktop"])
+def test_eyes_with_torsion_see_their_targets(name):
+    scene = er.load_scene(name).with_(target_mm=TARGETS)
+    scene = scene.with_({"targets.torsion_deg": 5.0})
+    frames = scene.frames()
+    plain = scene.with_({"targets.torsion_deg": 0.0}).frames()
+    for row, space in enumerate(space_labels(frames, er.trace(frames))):
+        point, way = (np.array(space["world"][key]) for key in ("line_of_sight_point_mm", "line_of_sight"))
+        gap = frames.index.target_mm[row] - point
+        assert np.linalg.norm(np.cross(gap, way)) < 1e-9
+        pose = frames.pose
+        listing = -np.arcsin(
+            np.sin(pose.azimuth_rad[row]) * np.sin(pose.elevation_rad[row])
+            / (1 + np.cos(pose.azimuth_rad[row]) * np.cos(pose.elevation_rad[row]))
+        )  # fmt: skip
+        assert np.degrees(pose.torsion_rad[row] - listing) == pytest.approx(5.0, abs=1e-9)
+        assert abs(pose.azimuth_rad[row] - plain.pose.azimuth_rad[row]) > 1e-4  # the optic axis moves about the sight
+
+
+def test_torsion_of_a_pose_is_added_to_listings():
+    bare = er.load_scene("headset").with_(gaze_deg=[[10, 5]])
+    turned = bare.with_({"poses.0.torsion_deg": 3.0})
+    gap = turned.frames().pose.torsion_rad - bare.frames().pose.torsion_rad
+    np.testing.assert_allclose(np.degrees(gap), 3.0, atol=1e-12)
+    with pytest.raises(er.InputError, match="torsion_deg"):
+        bare.with_({"poses.0.torsion_deg": 60.0})

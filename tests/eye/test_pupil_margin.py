@@ -16,9 +16,10 @@ from eyerender.eye.parts import ConicSpec
 from eyerender.eye.spec import EyeSpec
 from eyerender.scene import Scene, load_scene
 from eyerender.scene.spec import SceneSpec
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 PRESETS = ("desktop_tracker", "headset", "webcam", "stress")
-BARE = ("guestrin2006", "blignaut2014", "head_mounted", "quickstart")
+BARE = ("guestrin2006", "blignaut2014", BARE_HEAD_MOUNTED, "quickstart")
 
 RECORDED = (
     [0.0, 0.0154514148296, 0.0000125211860, 0.0010028379444, 0.0017529116020, -0.0010562419659],
@@ -104,7 +105,7 @@ def test_a_dilating_pupil_moves_to_the_temple(model):
 def test_the_shift_is_seen_in_the_picture():
     # A camera on the axis of an eye that does not turn: Gauss' formula for the image of the stop's centre through the
     # cornea, n / s' - 1 / s = (n - 1) / R, and a pinhole.
-    data = load_scene("head_mounted").spec.to_mapping()
+    data = load_scene(BARE_HEAD_MOUNTED).spec.to_mapping()
     data["rig"]["cameras"][0] |= {"position_mm": [60.0, -31.5, 0.0], "look_at_mm": [0.0, -31.5, 0.0]}
     del data["targets"]
     data["poses"] = [{"azimuth_deg": 0.0, "elevation_deg": 0.0}]

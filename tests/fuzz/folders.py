@@ -173,8 +173,8 @@ def _images(above: int) -> Callable[[Path], Any]:
     def read(path: Path) -> Any:
         import warnings
 
+        from eyerender.dataset.validation.lines import compare_lines
         from eyerender.dataset.validation.problems import FolderProblems
-        from eyerender.dataset.validation.shards import compare_lines
         from eyerender.folders.imagefolder import ImageFolder
 
         with warnings.catch_warnings(action="ignore"):
@@ -230,7 +230,7 @@ LINE = b'{"sample": 0, "file_name": "images/00000/00000000-right.png", "mask_fil
 def _made(digest: str, backend: str = "llvm") -> dict[str, Any]:
     """Content of a done.json, or of a checkpoint, for one picture."""
     from eyerender.dataset.done import cpu_family, run_versions
-    from eyerender.dataset.rounding import rounding
+    from eyerender.dataset.environment import rounding
 
     done = {"schema": "eyerender/shard/1", "shard": 0, "samples": [0, 1], "chosen": None, "images": 1, "digest": digest}
     done |= {"images_saturated": 0, "versions": run_versions(), "backend": {"name": backend, "device": "x"}}

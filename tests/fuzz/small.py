@@ -250,14 +250,14 @@ def _verdict(path: Path) -> Any:
 
 
 def _answers(path: Path) -> Any:
-    from eyerender.apps.benchmark.answers import Answers
+    from eyerender.apps.benchmark.asking import Answers
 
     known = Answers(path, "x")
     return known.get("x", 0)
 
 
 def _answers_seeds() -> list[bytes]:
-    from eyerender.apps.benchmark.answers import _SCHEMA
+    from eyerender.apps.benchmark.asking import _SCHEMA
 
     first = json.dumps({"schema": _SCHEMA, "task": "x"})
     return [f"{first}\n{json.dumps(['x', 0, '{}', '{}', 0.1])}\n".encode()]
@@ -306,9 +306,7 @@ SMALL: dict[str, Reader] = {
     "rig": Reader("a.yaml", _rig, _rig_seeds),
     "plan": Reader("a.yaml", _plan, _plan_seeds),
     "sweep": Reader(
-        "a.yaml",
-        _sweep,
-        lambda: [b"format: 1\nscene: guestrin2006\nsweep:\n  resolution_scale: [1.0, 0.5]\n"],
+        "a.yaml", _sweep, lambda: [b"format: 1\nscene: guestrin2006\nsweep:\n  resolution_scale: [1.0, 0.5]\n"]
     ),
     "named": Reader("a.json", _named, _seeds({"kind": "dataset", "file": "b.obj", "x": ["a.json", 1]})),
     "table-draw": Reader("a.csv", _table_draw, lambda: [b"a,b,w\n1,2,0.5\n3,4e-2,1\n"]),

@@ -14,6 +14,7 @@ from eyerender.base.arrays import frozen
 from eyerender.base.status import Status
 from eyerender.cli.main import run
 from eyerender.gaze.estimate import angular_error_deg
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def test_a_frame_is_lost_only_without_the_glints_that_are_needed(ring, estimator
 
 
 def test_two_cameras_need_two_glints_each():
-    scene = er.load_scene("head_mounted")
+    scene = er.load_scene(BARE_HEAD_MOUNTED)
     rig = scene.spec.to_mapping()["rig"]
     rig["cameras"].append({**rig["cameras"][0], "position_mm": [30.0, -20.0, -14.0]})
     scene = scene.with_({"rig": rig})

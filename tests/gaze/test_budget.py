@@ -14,6 +14,7 @@ from eyerender.base.errors import InputError
 from eyerender.cli.main import run
 from eyerender.gaze.budget import displacement, error_vectors_deg
 from eyerender.gaze.estimate import GazePoints, angular_error_deg
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 TARGETS, SEEDS = (8, 5), 20
 DEG_PER_PX = 0.05
@@ -249,7 +250,7 @@ def test_the_command_without_images(capsys, tmp_path):
     assert f"{data['mean_deg']:.4f} deg" in printed
     assert "rms deg          shift deg        pattern deg        scatter deg            net deg" in printed
     assert f"{data['causes'][0]['net_low_deg']:+.4f} to {data['causes'][0]['net_high_deg']:+.4f}" in printed
-    posed = er.load_scene("head_mounted").with_(gaze_deg=(5.0, 3.0)).spec
+    posed = er.load_scene(BARE_HEAD_MOUNTED).with_(gaze_deg=(5.0, 3.0)).spec
     posed.dump(tmp_path / "posed.yaml")
     assert run(["budget", str(tmp_path / "posed.yaml"), "--estimator", "regression"]) == 2
     assert "posed.yaml: there are no targets" in capsys.readouterr().err

@@ -51,11 +51,14 @@ def test_lost_samples_and_the_ellipse_of_normal_ones():
     assert np.isnan([nothing.sd_deg, nothing.accuracy_deg, nothing.bcea_deg2]).all()
 
 
-@pytest.mark.parametrize("ratio", [0.3, 1.0, np.sqrt(2), 1.8])
-def test_noise_has_the_size_and_the_type_that_are_asked_for(ratio):
-    """RMS-S2S over SD within 3 %, the SD of pupil and glint as well; both cameras have series of their own."""
+@pytest.mark.parametrize(("ratio", "samples"), [(0.3, 20000), (np.sqrt(2), 4000), (1.8, 4000)])
+def test_noise_has_the_size_and_the_type_that_are_asked_for(ratio, samples):
+    """RMS-S2S over SD within 3 %, the SD of pupil and glint as well; both cameras have series of their own.
+
+    Samples of slow noise, with a low ratio, depend on each other, so more are needed to know them to 1.6 %.
+    """
     scene = er.load_scene("guestrin2006")
-    seen = er.trace(scene.frames()[:2]).take(np.tile([0, 1], 20000))
+    seen = er.trace(scene.frames()[:2]).take(np.tile([0, 1], samples))
     found = seen.with_noise(0.2, seed=4, s2s_over_sd=ratio)
     for one, two in (
         (found.pupil.centre_px, seen.pupil.centre_px),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ import eyerender as er
 from eyerender.apps.live.drawing import colours_of, extent_mm, strokes
 from eyerender.apps.live.readout import feature_table
 from eyerender.apps.live.setup import Setup
+from eyerender.cli.main import run
 from eyerender.imaging.moments import eye_motion
 from eyerender.report.style import ANALYTIC, IMAGE
 
@@ -46,7 +49,7 @@ def test_everything_is_drawn_and_labelled():
     targeted = setup.following(2)
     again = strokes(targeted.frames(), er.trace(targeted.frames()), row)
     assert "target" in [label.text for label in again.labels]
-    middle, radius = extent_mm(found, setup.apex_mm)
+    middle, radius = extent_mm(found, setup.apex_mm, setup.scene.rig)
     assert np.linalg.norm(found.ends_mm.reshape(-1, 3) - middle, axis=1).max() <= radius
     np.testing.assert_allclose(colours_of([ANALYTIC])[0] * 255, np.array([0, 0x72, 0xB2]))
 
@@ -61,3 +64,9 @@ def test_the_table_names_reasons_and_differences():
     assert "outside the limbus" in table
     assert ">0.00<" in table
     assert "not found" not in feature_table(one, None, hidden)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("nicegui") is not None, reason="the extra `live` is installed")
+def test_a_missing_extra_is_one_line(capsys):
+    assert run(["live", "headset"]) == 2
+    assert capsys.readouterr().err == "error: live: needs NiceGUI (the extra 'live'); run: pip install nicegui\n"

@@ -11,27 +11,18 @@ import pytest
 from PIL import Image
 
 import eyerender as er
-from eyerender.apps.live.painter import (
-    BUDGET_S,
-    PREVIEW_PX,
-    Order,
-    Pace,
-    Painter,
-    Shown,
-    coarser,
-    enlarged,
-    line_of,
-)
+from eyerender.apps.live.painter import BUDGET_S, PREVIEW_PX, Order, Pace, Painter, Shown, coarser, enlarged, line_of
 from eyerender.apps.live.setup import Setup
 from eyerender.folders.imagefile import preview
 from eyerender.imaging.capture import render_job
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 pytestmark = pytest.mark.render
 
 
 @pytest.fixture(scope="module")
 def setup():
-    scene = er.load_scene("head_mounted").with_({"image.window_px": [160, 120]})
+    scene = er.load_scene(BARE_HEAD_MOUNTED).with_({"image.window_px": [160, 120]})
     return Setup.of(scene)
 
 

@@ -12,10 +12,12 @@ import pytest
 import yaml
 
 import eyerender as er
-from eyerender.apps.live.readout import calibrated, gaze_line
-from eyerender.apps.live.setup import Setup, directions
+from eyerender.apps.live.readout import calibrated, exposure_line, gaze_line, poses_line
+from eyerender.apps.live.setup import Setup, directions, half_width_deg, lobe_exponent, ring_note
 from eyerender.apps.live.source import python_source
 from eyerender.base.errors import InputError
+
+POSES = [{"azimuth_deg": x, "elevation_deg": y} for y in (-10.0, 0.0, 10.0) for x in (-12.0, 0.0, 12.0)]
 
 
 def setup_of(name):
@@ -127,7 +129,7 @@ def test_bad_input_names_the_key_and_changes_nothing(desk):
         (lambda: desk.with_light(7, intensity_mw_sr=1.0), "lights"),
         (lambda: desk.following(99), "fixation"),
         (lambda: desk.with_opening(1.5), "region.blink"),
-        (lambda: setup_of("head_mounted").with_opening(0.5), "region.blink"),
+        (lambda: setup_of("guestrin2006").with_opening(0.5), "region.blink"),
     ):
         with pytest.raises(InputError, match=path):
             change()
@@ -201,5 +203,61 @@ def test_the_gaze_error_is_that_of_a_regression_calibrated_on_the_present_rig(de
     assert "follow a target" in gaze_line(
         desk.looking(3, 4), calibrated(desk), er.trace(desk.looking(3, 4).frames()).take([0]), None
     )
-    head = setup_of("head_mounted")
-    assert "no screen" in gaze_line(head, calibrated(head), er.trace(head.frames()).take([0]), None)
+
+
+def test_without_a_screen_the_error_is_that_of_a_direction():
+    start = Setup.of(er.load_scene("headset").with_({"rig.screen": None, "targets": None, "poses": POSES}))
+    frames = start.frames()
+    truth = er.trace(frames).take([start.row(frames)])
+    line = gaze_line(start, calibrated(start), truth, None)
+    assert float(re.search(r"exact features ([\d.]+)°$", line)[1]) < 0.5
+
+
+def test_the_first_picture_is_that_of_the_middle_pose():
+    assert setup_of("headset").fixation == 4
+    assert setup_of("desktop_tracker").fixation == 4
+
+
+def test_the_head_moves_against_the_rig_and_is_saved(desk):
+    moved = desk.with_shift((2.0, -1.0, 0.5))
+    np.testing.assert_allclose(moved.apex_mm - desk.apex_mm, [2.0, -1.0, 0.5], atol=1e-9)
+    before, after = desk.origin.subject.head_positions_mm, moved.saved().subject.head_positions_mm
+    np.testing.assert_allclose(np.subtract(after, before), [[2.0, -1.0, 0.5]] * len(before), atol=1e-9)
+    assert moved.with_shift((0.0, 0.0, 0.0)).saved() == desk.saved()
+
+
+def test_field_and_size_of_the_picture():
+    start = setup_of("headset")
+    wide = start.with_field(0, 80.0)
+    assert wide.field_deg(0) == pytest.approx(80.0, abs=1e-4)
+    assert wide.scene.rig.cameras[0].K[0, 0] == pytest.approx(320 / np.tan(np.radians(40)), rel=1e-6)
+    half = start.with_width(320)
+    assert half.scene.rig.cameras[0].resolution_px == (320, 240)
+    assert half.field_deg(0) == pytest.approx(start.field_deg(0), abs=1e-9)
+    with pytest.raises(InputError, match="1 to 150"):
+        start.with_field(0, 170.0)
+
+
+def test_lobes_have_half_their_intensity_at_their_half_width():
+    for width in (5.0, 30.0, 60.0):
+        assert np.cos(np.radians(width)) ** lobe_exponent(width) == pytest.approx(0.5, abs=1e-6)
+        assert half_width_deg(lobe_exponent(width)) == pytest.approx(width, abs=1e-5)
+    assert lobe_exponent(90.0) == 0.0
+
+
+def test_a_light_of_a_ring_says_that_it_moves_with_its_camera():
+    rig = er.load_scene("headset").spec.rig
+    assert "ring of 8 that moves with camera 0" in ring_note(rig, 7)
+    assert ring_note(rig.with_light(3, moved_mm=(1, 0, 0)), 3) == ""
+
+
+def test_all_poses_and_the_light_on_the_eye_are_told():
+    start = setup_of("headset")
+    line = poses_line(start)
+    assert line.startswith("All 9 poses: pupil in 9, ")
+    bound = er.information(start.scene.replaced(start.origin).frames())["right"].gaze_deg
+    assert f"{bound.max():.2g}°" in line
+    dim, bright = (exposure_line(setup) for setup in (start, start.with_light(0, intensity_mw_sr=10.0)))
+    shares = [float(re.search(r"cornea ([\d.]+) %", text)[1]) for text in (dim, bright)]
+    assert 0 < shares[0] < shares[1]
+    assert "not a conformity test" in dim

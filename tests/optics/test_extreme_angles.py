@@ -8,7 +8,7 @@ import pytest
 from eyerender.base.status import Status
 from eyerender.optics.solve import apparent_points
 from eyerender.optics.surfaces import Surface
-from eyerender.optics.surfaces_biconic import Biconic
+from eyerender.optics.surfaces_graph import Biconic
 from eyerender.optics.surfaces_quadric import Quadric
 from eyerender.optics.trace import inward_path, trace
 from eyerender.optics.transforms import tilt_rotation

@@ -16,8 +16,8 @@ from eyerender.optics.corneas import WINDOW
 from eyerender.optics.graph_kernels import bracket
 from eyerender.optics.graphs import graphs_of
 from eyerender.optics.surfaces import components
+from eyerender.optics.surfaces_measured import mirrored, orders, zernike
 from eyerender.optics.topography import smooth_heights, spline_coefficients
-from eyerender.optics.zernike import mirrored, orders, zernike
 from tests.support.corneas import conic_depth, grid_of, keratoconus, measured_shapes, zernike_of
 
 

@@ -1,14 +1,24 @@
-"""Draws of people: moments, purity, conditions, memory."""
+"""The table of people and draws from it: moments, purity, conditions, memory, and the survey of them."""
 
 from __future__ import annotations
 
+import csv
+import json
 import tracemalloc
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 import eyerender as er
-from eyerender.population.model import default_reference
+from eyerender.base.errors import InputError
+from eyerender.cli.main import run
+from eyerender.population.marginals import Lognormal, Mixture, Normal, Part, Uniform
+from eyerender.population.model import Model, Reference, completed, default_reference, nearest_correlation
+from eyerender.population.people import PopulationSpec
+from eyerender.population.statistics import refusals, survey
+from eyerender.population.table import PopulationTable, default_table
+from eyerender.region.anatomy import Skin
 
 PRESETS = ("adults", "emmetropic_adults", "myopes", "children", "elderly")
 
@@ -206,3 +216,193 @@ def test_lengths_radii_and_refractions_correlate_as_in_samples():
         values = {"ratio": length / radius, "length": length, "radius": radius}
         for name, (low, high) in pairs.items():
             assert low < np.asarray(np.corrcoef(values[name], refraction))[0, 1] < high, (preset, name)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("survey") / "people"
+    assert run(["population", "myopes", "-o", str(out), "--count", "600", "--check", "3", "--faces", "0"]) == 0
+    return out
+
+
+def test_the_table_holds_the_people_of_the_draw(folder):
+    with (folder / "people.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    people = er.Population("myopes").draw(600)
+    assert [int(row["subject"]) for row in rows] == list(range(600))
+    for name, column in people.columns().items():
+        np.testing.assert_allclose([float(row[name]) for row in rows], column, rtol=1e-5, atol=1e-12, err_msg=name)
+
+
+def test_the_summary_agrees_with_the_draw(folder):
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    people = er.Population("myopes").draw(600)
+    for name, told in summary["quantities"].items():
+        x = people[name] if people[name].ndim == 1 else people[name][:, 0]
+        assert told["mean"] == pytest.approx(x.mean(), rel=1e-9, abs=1e-9), name
+        assert told["sd"] == pytest.approx(x.std(), rel=1e-9), name
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Atchison" in page
+    assert "chosen" in page
+
+
+@pytest.mark.slow
+def test_errors_are_standard_errors():
+    """Over many seeds, mean and spread in units of their errors have a variance of 1."""
+    population = er.Population("adults")
+    errors: list[float] = []
+    for seed in range(12):
+        for m in survey(population, 500, seed).moments:
+            if np.isfinite(m.expected_mean):
+                errors += m.errors
+    # Some 1600 numbers, of which those of both eyes' and correlated quantities count less.
+    assert np.std(errors) == pytest.approx(1.0, abs=0.1)
+
+
+def test_refusals_move_the_mean():
+    deep = {"chamber_depth_mm": {"kind": "uniform", "low": 0.3, "high": 3.6}}
+    found = refusals(er.Population("adults", replace=deep), 12, 1)
+    assert 0 < found.people < 12
+    assert sum(found.reasons.values()) >= found.people
+    assert found.shifts["chamber_depth_mm"] > 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["nobody"], "PRESET: must be one of adults"),
+        (["adults", "--count", "1"], "--count: must be 2 to"),
+        (["adults", "--faces", "-1"], "--faces: must be 0 to"),
+        (["adults", "--seed", "-1"], "--seed: must be 0 to"),
+    ],
+)
+def test_bad_input_ends_with_one_line(arguments, line, tmp_path, capsys):
+    assert run(["population", *arguments, "-o", str(tmp_path / "out")]) == 2
+    assert line in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_of_a_population(tmp_path, capsys):
+    file = tmp_path / "p.yaml"
+    file.write_text("population:\n  preset: adults\n  where: {age_years: [30, 31], colour: 3}\n", encoding="utf-8")
+    assert run(["population", str(file), "-o", str(tmp_path / "out")]) == 2
+    assert "where.colour: no such quantity" in capsys.readouterr().err
+
+
+def test_every_number_is_marked():
+    table = default_table()
+    for name, quantity in table.quantities.items():
+        told = ", ".join(source.what for source in quantity.sources)
+        assert all(source.text.strip() for source in quantity.sources), name
+        if "all" not in told and quantity.slopes:
+            assert "slopes" in told, name
+    assert all(pair.text.strip() for pair in table.correlations)
+    assert all(constant.text.strip() for constant in table.constants.values())
+
+
+def test_correlations_of_the_table_hold_together():
+    reference = default_reference()
+    model = Model(reference, reference.distributions)
+    assert reference.distance < 1e-9, "the table's correlations need no nearest matrix"
+    for pair in reference.table.correlations:
+        if pair.of == "values":
+            assert model.expected_correlation(*pair.pair) == pytest.approx(pair.r, abs=1e-6), pair.pair
+        i, j = (model.places(name)[0] for name in pair.pair)
+        if pair.of == "residuals":
+            assert reference.latent[i, j] == pytest.approx(pair.r, abs=1e-6), pair.pair
+
+
+def test_nearest_correlation_of_highams_example():
+    """Higham 2002, section 4: the tridiagonal matrix of 2 and -1, whose nearest correlation matrix he prints."""
+    given = 2 * np.eye(4) - np.eye(4, k=1) - np.eye(4, k=-1)
+    found = nearest_correlation(given, smallest=0.0)
+    printed = [[1, -0.8084, 0.1916, 0.1068], [-0.8084, 1, -0.6562, 0.1916]]
+    np.testing.assert_allclose(found[:2], printed, atol=1e-4)
+    assert np.linalg.eigvalsh(found)[0] > -1e-9
+
+
+def test_nearest_correlation_leaves_a_valid_matrix():
+    a = np.random.default_rng(3).normal(size=(6, 20))
+    valid = np.asarray(np.corrcoef(a))
+    np.testing.assert_allclose(nearest_correlation(valid), valid, atol=1e-12)
+
+
+def test_completed_matrix_has_independent_pairs():
+    wanted = np.eye(4)
+    pairs = [(0, 1), (1, 2), (0, 2), (2, 3)]
+    for (i, j), r in zip(pairs, (0.5, 0.6, 0.4, -0.7), strict=True):
+        wanted[i, j] = wanted[j, i] = r
+    found = completed(wanted, pairs)
+    for i, j in pairs:
+        assert found[i, j] == pytest.approx(wanted[i, j], abs=1e-12)
+    inverse = np.linalg.inv(found)
+    assert abs(inverse[0, 3]) < 1e-9
+    assert abs(inverse[1, 3]) < 1e-9
+
+
+def mean_of(marginal):
+    return getattr(marginal, "mean", 0.0)
+
+
+@pytest.mark.parametrize(
+    "marginal",
+    [
+        Normal(kind="normal", mean=1.0, sd=2.0),
+        Normal(kind="normal", mean=1.0, sd=2.0, low=0.5, high=3.0),
+        Normal(kind="normal", mean=-9.0, sd=1.0, low=-4.0),
+        Lognormal(kind="lognormal", median=0.06, sigma=0.4),
+        Uniform(kind="uniform", low=18.0, high=70.0),
+        Mixture(kind="mixture", parts=(Part(weight=7, mean=0.1, sd=0.8), Part(weight=3, mean=-2.2, sd=2.2))),
+    ],
+)
+def test_marginals_map_there_and_back(marginal):
+    z = np.linspace(-5, 5, 201)
+    # Where the whole distribution lies in a tail, its lower end keeps fewer digits.
+    np.testing.assert_allclose(marginal.latent(marginal.at(z)), z, atol=5e-4 if mean_of(marginal) < -5 else 2e-6)
+    u = (np.arange(200_000) + 0.5) / 200_000
+    x = marginal.at(ndtri(u))
+    mean, sd = marginal.moments
+    assert mean == pytest.approx(x.mean(), abs=2e-3 * sd)
+    assert sd == pytest.approx(x.std(), rel=2e-3)
+
+
+def changed(**parts):
+    data = default_table().to_mapping()
+    for path, value in parts.items():
+        keys = path.split("__")
+        node = data
+        for key in keys[:-1]:
+            node = node[key]
+        node[keys[-1]] = value
+    return PopulationTable.from_mapping(data)
+
+
+def test_a_spread_below_what_is_explained_is_refused():
+    with pytest.raises(InputError, match=r"quantities\.axial_length_mm\.sd"):
+        Reference.of(changed(quantities__axial_length_mm__sd=0.3))
+
+
+def test_wrong_tables_name_the_key():
+    with pytest.raises(InputError, match=r"correlations\.0\.pair"):
+        changed(
+            correlations=[{"pair": ["age_years", "ipd_mm"], "r": 0.5, "of": "values", "mark": "chosen", "text": "x"}]
+        )
+    with pytest.raises(InputError, match="unknown quantity"):
+        changed(presets__adults2={"description": "x", "replace": {"no": {"kind": "fixed", "value": 1.0}}})
+
+
+def test_the_history_of_skin_has_random_numbers_of_its_own():
+    aged, bare = (PopulationSpec(preset="adults", skin_history=h).numbers(400, 3) for h in (1.0, 0.0))
+    own = {"skin.folds", "skin.mottling", "skin.relief_mm", "skin.liner", "skin.shadow"}
+    assert all(np.array_equal(aged[name], bare[name]) for name in set(aged) - own)
+    assert not any(bare[name].any() for name in ("skin.folds", "skin.liner", "skin.shadow"))
+    skin = Skin()
+    assert np.all(bare["skin.mottling"] == skin.mottling)
+    assert np.all(bare["skin.relief_mm"] == skin.relief_mm)
+    assert np.corrcoef(aged["age_years"], aged["skin.folds"])[0, 1] > 0.5
+    made_up = aged["skin.liner"] > 0
+    assert not np.any(made_up & (aged["male"] > 0.5))
+    assert np.mean(made_up[aged["male"] < 0.5]) == pytest.approx(1 / 3, abs=0.09)
+    # A person's numbers depend on neither the number of people nor the first of them.
+    part = PopulationSpec(preset="adults").numbers(3, 3, first=7)
+    assert all(np.array_equal(part[name], aged[name][7:10]) for name in own)

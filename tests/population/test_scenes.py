@@ -11,8 +11,8 @@ import eyerender as er
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.realise import realise, sample_line, windows_of
 from eyerender.eye.entrance import entrance_pupil_mm
+from eyerender.eye.landmarks import at_cornea_d
 from eyerender.eye.pose import Poses, rigid_motion
-from eyerender.eye.refraction import at_cornea_d
 from eyerender.optics.solve import apparent_points
 from eyerender.scene.scene import demand_d
 

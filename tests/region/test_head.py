@@ -21,6 +21,7 @@ from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
 from eyerender.region.headspec import Head
+from tests.support.paths import BARE_HEAD_MOUNTED
 
 CENTRE_MM = np.array([-13.0, 0.4, 0.1])
 
@@ -187,7 +188,7 @@ def command(folder, **head):
     """Render a scene with a head mesh by the command line; return the exit code."""
     keys = {"file": "head.obj", "forward": [1, 0, 0], "right_eye": [72.0, 20.0, 31.0], **head}
     scene = {
-        **er.load_scene("head_mounted").spec.to_mapping(),
+        **er.load_scene(BARE_HEAD_MOUNTED).spec.to_mapping(),
         "region": {"head": {k: v for k, v in keys.items() if v}},
     }
     (folder / "scene.yaml").write_text(yaml.safe_dump(scene))

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import eyerender as er
 from eyerender.imaging.capture import render_job
+from eyerender.imaging.labels import image_labels
 from eyerender.imaging.moments import moments
 from eyerender.rendering.records.job import SubFrames
 from eyerender.scene.observation import EYES
 from tests.support.sequences import in_time, turning
 
-SMALL = {"image": {"spp": 2, "window_px": [160, 120]}, "sensor": {"noise": False, "exposure_ms": 4.0}}
-SLOW_ROWS = {"shutter": {"rolling": {"row_us": 20.0}}}
+SMALL: dict[str, Any] = {"image": {"spp": 2, "window_px": [160, 120]}, "sensor": {"noise": False, "exposure_ms": 4.0}}
+SLOW_ROWS: dict[str, Any] = {"shutter": {"rolling": {"row_us": 20.0}}}
 
 
 def picture(scene, row, renderer):
@@ -50,7 +52,7 @@ def test_a_pulse_bands_a_rolling_shutter_as_the_overlap_says(renderer):
 
 def test_rows_of_a_rolling_shutter_show_the_eye_at_their_own_time(renderer):
     """The middle of the pupil in each row of the mask is where the eye was when the row was exposed."""
-    short = {**SMALL, "sensor": {"noise": False, "exposure_ms": 1.0}}
+    short: dict[str, Any] = {**SMALL, "sensor": {"noise": False, "exposure_ms": 1.0}}
     scene = in_time(sequence=turning(400.0, -2.0, 0.03), camera=SLOW_ROWS, **short)
     image, timing = picture(scene, 0, renderer), scene.timings[0]
     frames = scene.frames()
@@ -103,6 +105,19 @@ def test_moments_are_at_most_half_a_pixel_apart_and_add_up_to_the_exposure():
     assert np.all(sum(part.labelled.astype(int) for part in parts if part.labelled is not None) == 1)
 
 
+def test_moments_share_lids_and_skin_without_a_change_of_the_picture(renderer):
+    """The same exposure, with every moment rendered whole and with lids of its own, differs less than blur may."""
+    picture_of = {"image": {"spp": 48, "window_px": [160, 120]}}
+    scene = in_time(sequence=turning(500.0, -5.0, 0.02), camera=SLOW_ROWS, **{**SMALL, **picture_of})
+    frames = scene.frames().take([1])
+    job = render_job(frames, 0)
+    shared = moments(frames, 0, job, render_job)
+    alone = [replace(p, moving=None, jobs=(replace(p.jobs[0], posed=None, region=job.region),)) for p in shared]
+    assert 1 < len({id(part.jobs[0].posed) for part in shared}) < len(shared)
+    light, whole = (renderer.render(job, spp=48, moments=parts).irradiance for parts in (shared, alone))
+    assert np.sqrt(np.mean((light - whole) ** 2)) < 0.005 * np.sqrt(np.mean(whole**2))
+
+
 def test_labels_of_a_blink_and_of_the_pupil_are_those_of_the_instant(renderer, tmp_path):
     keys = {"lids": {"blinks_per_minute": 0, "at_s": [0.0]}, "pupil": {"time_s": [0, 1], "mm": [3.0, 4.0]}}
     scene = in_time(sequence={**turning(0.0, 0.0, 0.05), **keys}, **SMALL)
@@ -145,11 +160,33 @@ def test_a_rolling_shutter_before_a_moving_eye_is_valid(renderer, tmp_path):
     assert all(line["records"][0]["pupil"]["time_s"] != line["time_s"] for line in lines)
 
 
+def test_lids_and_spots_under_a_rolling_shutter_are_those_of_their_rows(renderer):
+    """Each landmark is where it is in a picture at the time of its row; in a blink, and a saccade."""
+    lids = {"time_s": [-0.05, 0.05], "blink": [0.0, 0.8]}
+    scene = in_time(sequence={**turning(200.0, -2.0, 0.05), "lids": lids}, camera=SLOW_ROWS, **SMALL)
+    frames = scene.frames().take([1])
+    (image,) = er.render_windows(frames, renderer=renderer)
+    labels = image_labels(image, er.trace(frames))
+    timing, start = scene.timings[0], frames.index.start_s[0]
+    for lid in ("upper", "lower"):
+        for k in (4, 8, 12):
+            x, y = labels["lid_margins_px"][lid][k]
+            then = frames.at([0], np.array([timing.ambient_s(start, y)]))
+            bound, _ = renderer.bind(render_job(then, 0), lit=False)
+            np.testing.assert_allclose((x, y), bound.host.lid_margins_px[lid][k], atol=2e-3)
+    for glint in labels["glints"]:
+        if glint["visible"] and glint["visible_share"] == 1.0:
+            assert np.linalg.norm(np.subtract(glint["spot_xy_px"], glint["xy_px"])) < 0.05
+    both = (labels["lid_margins_px"], image.rendered.lid_margins_px)  # the latter at mid-exposure
+    own, middle = (np.array(lids["upper"] + lids["lower"]) for lids in both)
+    assert np.abs(own - middle).max() > 0.2
+
+
 def test_fields_of_an_interlaced_camera_show_the_eye_one_after_the_other(renderer):
     """Even rows are those of a sharp picture at the first field's exposure, odd rows of one at the second's."""
     delayed = {"shutter": {"interlaced": {"delay_ms": 5.0}}, "frame_rate_hz": 50.0}
     picture_of = {"spp": 32, "window_px": [160, 120]}
-    short = {"image": picture_of, "sensor": {"noise": False, "exposure_ms": 0.2}, "region": None}
+    short: dict[str, Any] = {"image": picture_of, "sensor": {"noise": False, "exposure_ms": 0.2}, "region": None}
     scene = in_time(sequence=turning(200.0, -2.0, 0.04), camera=delayed, **short)
     both, frames = picture(scene, 0, renderer), scene.frames()
     assert frames.index.time_s[0] == pytest.approx(2.6e-3)  # midway between the fields

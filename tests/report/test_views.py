@@ -1,4 +1,4 @@
-"""Drawings of eyes and scenes: vector output that shows what it says, from the numbers of the model."""
+"""The style of figures, and drawings of eyes and scenes: vector output that shows the numbers of the model."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+from eyerender.apps.study.figures import lines_figure, map_figure, rows_figure
 from eyerender.cli.main import run
 from eyerender.eye.catalogue import load_eye
 from eyerender.report.eye_section import eye_section
 from eyerender.report.scene_view import scene_view
+from eyerender.report.style import figure, svg
 from eyerender.scene import load_scene
 
 
@@ -75,27 +77,94 @@ def test_printed_eye_loads_back_as_the_same_eye(tmp_path, capsys):
 
 
 def test_purkinje_images_on_demand(capsys):
-    assert run(["features", "quickstart", "--eye", "E4", "--purkinje", "2", "3", "4", "--json", "-"]) == 0
+    assert run(["features", "quickstart", "--eye", "E4", "--purkinje", "1", "2", "3", "4", "--json", "-"]) == 0
     data = json.loads(capsys.readouterr().out)
-    seen = {(p["frame"], p["eye"], p["image"]) for p in data["purkinje"]}
-    assert seen == {(r["frame"], r["eye"], k) for r in data["records"] for k in (1, 2, 3, 4)}
-    lost = [p for p in data["purkinje"] if p["status"] != "ok"]
+    assert "purkinje" not in data
+    images = [p | {"eye": r["eye"]} for r in data["records"] for p in r["purkinje"]]
+    assert all([p["order"] for p in r["purkinje"]] == [1, 2, 3, 4] for r in data["records"])  # one lamp
+    lost = [p for p in images if p["status"] != "ok"]
     # Seen 11 to 36 degrees beside the axis, the lens' front, which flattens outwards, has its image outside the pupil,
     # or none; the other images are there.
-    assert {p["image"] for p in lost} == {3}
+    assert {p["order"] for p in lost} == {3}
     assert {p["reason"] for p in lost} == {
         "behind the iris",
         "no point of the surface mirrors the light to the viewpoint",
     }
-    assert all(p["reason"] is None and p["in_image"] for p in data["purkinje"] if p["status"] == "ok")
-    data["purkinje"] = [p for p in data["purkinje"] if p["status"] == "ok"]
-    first = [p for p in data["purkinje"] if p["image"] == 1]
+    assert all(p["reason"] is None and p["in_image"] for p in images if p["status"] == "ok")
+    images = [p for p in images if p["status"] == "ok"]
+    first = [p for p in images if p["order"] == 1]
     assert [p["xy_px"] for p in first] == [r["glints"][0]["xy_px"] for r in data["records"]]
     assert len(data["non_ellipticity_px"]) == 18
     assert 0 < max(data["non_ellipticity_px"]) < 0.05  # of an apparent pupil of 13 px
     # The image in the back of the lens is inverted: it moves against the glint as the eye turns.
-    fourth = np.array([p["xy_px"] for p in data["purkinje"] if p["image"] == 4 and p["eye"] == "right"])
+    fourth = np.array([p["xy_px"] for p in images if p["order"] == 4 and p["eye"] == "right"])
     glint = np.array([p["xy_px"] for p in first if p["eye"] == "right"])
     pupil = np.array([r["pupil"]["centre_px"] for r in data["records"] if r["eye"] == "right"])
     a, b = glint - pupil, fourth - pupil
     assert np.corrcoef(a[:, 0], b[:, 0])[0, 1] < -0.9
+
+
+NAN = float("nan")
+
+
+def drawn(fig):
+    """Titles of the panels that are left, in their order, and the columns and rows of the grid."""
+    svg(fig)
+    panels = [ax for ax in fig.axes if ax.get_subplotspec() is not None]
+    grid = panels[0].get_subplotspec().get_gridspec()
+    return [ax.get_title() for ax in panels], (grid.ncols, grid.nrows)
+
+
+def test_panel_without_a_finite_value_is_left_out_and_the_others_close_up():
+    with figure(12.0, 6.0, 3, 2) as (fig, axes):
+        for k, ax in enumerate(axes.ravel()):
+            ax.set(title=str(k))
+            ax.axhline(0.0)  # a reference line is no data
+            ax.axhspan(0.0, 1.0)
+        axes[0, 0].plot([NAN, NAN])
+        axes[0, 1].scatter([], [])
+        axes[0, 2].scatter([1.0], [2.0])
+        axes[1, 0].plot([NAN, 1.0])
+        axes[1, 1].bar([0], [1.0])
+        axes[1, 2].pcolormesh(np.full((2, 2), NAN))
+        assert drawn(fig) == (["2", "3", "4"], (3, 1))
+        assert tuple(fig.get_size_inches()) == (12.0, 3.0)
+
+
+def test_first_panel_that_is_left_takes_the_labels_of_the_row():
+    with figure(9.0, 3.0, 2) as (fig, axes):
+        axes[0].set_yticks([0, 1], ["up", "down"])
+        axes[0].set_ylabel("way")
+        axes[1].scatter([1.0, 2.0], [0.0, 1.0])
+        axes[1].set_yticks([0, 1], ["", ""])
+        drawn(fig)
+        assert axes[1].get_ylabel() == "way"
+        assert [t.get_text() for t in axes[1].get_yticklabels()] == ["up", "down"]
+
+
+def test_figure_without_any_value_says_so():
+    with figure(9.0, 3.0, 2) as (fig, axes):
+        assert drawn(fig)[1] == (1, 1)
+        assert [t.get_text() for t in axes[0].texts] == ["no values"]
+
+
+@pytest.mark.parametrize(
+    ("draw", "panels"),
+    [
+        (lambda p: lines_figure(p, [1.0, 2.0], "x", "y"), {"one": {"E1": [NAN, NAN]}, "two": {"E1": [1.0, 2.0]}}),
+        (
+            lambda p: rows_figure(["a", "b"], p, "x", joined=True),
+            {"one": {"E1": [None, None]}, "two": {"E1": [1.0, None]}},
+        ),
+        (lambda p: rows_figure(["a", "b"], p, "x"), {"one": {"E1": [NAN, NAN]}, "two": {"E1": [1.0, 2.0]}}),
+        (
+            lambda p: map_figure(p, np.arange(2.0), np.arange(2.0), "x", "y", "deg"),
+            {"one": np.full((2, 2), NAN), "two": np.eye(2)},
+        ),
+    ],
+)
+def test_study_figures_draw_what_they_have(draw, panels):
+    def count(svg_element):
+        return svg_element.count('id="axes_')
+
+    assert count(draw(panels)) == count(draw({"two": panels["two"]}))

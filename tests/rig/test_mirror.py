@@ -240,10 +240,7 @@ def small(centre_px: np.ndarray, half_px: float) -> dict[str, object]:
     ("corners", "words"),
     [
         ([[0, 0, 0], [0, 10, 0], [0, 10, 10], [4, 0, 10]], "outline_mm.3 is 4 mm off the plane of point_mm and normal"),
-        (
-            [[0, 0, 0], [0, 10, 10], [0, 10, 0], [0, 0, 10]],
-            "outline_mm crosses itself: its sides from corner 0 and",
-        ),
+        ([[0, 0, 0], [0, 10, 10], [0, 10, 0], [0, 0, 10]], "outline_mm crosses itself: its sides from corner 0 and"),
     ],
 )
 def test_outlines_that_are_none_are_refused(corners, words):

@@ -21,7 +21,8 @@ RING: dict[str, Any] = {
     "outer_radius_mm": 9,
     "depth_mm": 4,
 }
-CAMERA = {"position_mm": [600, 0, 0], "look_at_mm": [0, 0, 0], "focal_length_px": 3000, "resolution_px": [640, 480]}
+POSITION = [600.0, 0.0, 0.0]
+CAMERA = {"position_mm": POSITION, "look_at_mm": [0, 0, 0], "focal_length_px": 3000, "resolution_px": [640, 480]}
 RIG: dict[str, Any] = {"cameras": [CAMERA], "lights": [{"position_mm": [600, 120, 0]}]}
 
 
@@ -137,9 +138,9 @@ def test_cameras_inside_a_body_are_refused_and_those_in_its_hole_are_not():
     assert len(bodies((5.0, 9.0))) == 1
     body = bodies((5.0, 9.0))[0]
     away = np.cross([1.0, 0.0, 0.0], [0.0, 0.6, 0.8])
-    start = np.array(CAMERA["position_mm"], dtype=float)
+    start = np.array(POSITION, dtype=float)
     assert [holds(body, start + d * away) for d in (0.0, 4.9, 5.1, 8.9, 9.1)] == [False, False, True, True, False]
-    beside = [*CAMERA["position_mm"][:2], CAMERA["position_mm"][2] + 7.0]
+    beside = [*POSITION[:2], POSITION[2] + 7.0]
     ring = {"centre_mm": beside, "inner_radius_mm": 5.0, "outer_radius_mm": 9.0, "depth_mm": 9.0}
     with pytest.raises(InputError, match=r"rig.obstacles.0: camera 0 is inside it"):
         er.Rig.from_mapping({**RIG, "obstacles": [{"ring": ring}]}).build().bodies()

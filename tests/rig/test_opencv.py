@@ -202,10 +202,7 @@ def test_a_scene_names_a_calibration_file(tmp_path, monkeypatch, capsys):
         ({"calibration": {"file": "camera.yml", "unit_mm": 0}}, "rig.cameras.0.calibration.unit_mm: must be > 0"),
         ({"calibration": {"file": "camera.yml", "K": 1}}, "rig.cameras.0.calibration.K: unknown key"),
         ({"calibration": {"K": 1}}, "rig.cameras.0.calibration.K: must be a list"),
-        (
-            {"resolution_px": [320, 240]},
-            "camera.yml: is for (640, 480) px, but resolution_px of the camera is",
-        ),
+        ({"resolution_px": [320, 240]}, "camera.yml: is for (640, 480) px, but resolution_px of the camera is"),
         ({"focal_length_px": 1000}, "rig.cameras.0: the calibration file gives the lens; remove focal_length_px"),
         ({"distortion": [1, 0, 0, 0, 0]}, "rig.cameras.0: the calibration file gives the lens; remove distortion"),
         ({"pan_deg": 10}, "rig.cameras.0: give position_mm with the direction, or neither"),

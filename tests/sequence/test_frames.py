@@ -47,8 +47,8 @@ def test_each_feature_under_a_rolling_shutter_is_seen_when_its_row_is_exposed():
     for light in np.flatnonzero(seen.glints.ok[row]).tolist():
         own = float(timing.ambient_s(frames.index.start_s[row], seen.glints.xy_px[row, light, 1]))
         assert seen.glints.time_s[row, light] == pytest.approx(own, abs=1e-12)
-        there = trace(frames.at([row], np.array([own])))
-        np.testing.assert_allclose(there.glints.xy_px[0, light], seen.glints.xy_px[row, light], atol=1e-9)
+        again = trace(frames.at([row], np.array([own])))
+        np.testing.assert_allclose(again.glints.xy_px[0, light], seen.glints.xy_px[row, light], atol=1e-9)
     assert seen.pupil.time_s[row] != frames.index.time_s[row]
 
 
@@ -99,6 +99,26 @@ def test_targets_of_the_rig_move_with_it_and_the_eye_follows():
     np.testing.assert_allclose(angle, 0.05 / 1.5 * (found.index.time_s + 0.5), atol=2e-5)  # to the nearest ms
     azimuth = found.pose.azimuth_rad
     np.testing.assert_allclose(np.diff(azimuth), np.diff(angle), rtol=0.1, atol=3e-5)
+
+
+def test_torsion_that_changes_does_not_turn_the_gaze_off_its_target():
+    """Wherever a table of torsion has a value, the eye is turned as with that value all the time."""
+    table = {"time_s": [0.0, 0.2, 0.4], "value_deg": [0.0, 5.0, -3.0]}
+    place = [600.0, 80.0, -50.0]
+    target = {"targets": [place], "drift_arcmin2_s": 0, "microsaccades_per_s": 0}
+    still = {"lids": {"blinks_per_minute": 0}, "pupil": {"hippus": 0}}
+    own = {"time_s": [0.0, 1.0], "target_mm": [place] * 2}
+    for gaze in ({**target, "torsion_deg": table}, {**own, "torsion_deg": [0.0, -3.0]}):
+        moving = in_time(sequence={"duration_s": 1.0, "gaze": gaze, **still})
+        at = [0.2, 0.4] if "targets" in gaze else [1.0]
+        for time_s, torsion in zip(at, (5.0, -3.0) if "targets" in gaze else (-3.0,), strict=True):
+            constant = in_time(sequence={"duration_s": 1.0, "gaze": {**target, "torsion_deg": torsion}, **still})
+            found, expected = (scene.frames_at(time_s).pose for scene in (moving, constant))
+            for name in ("azimuth_rad", "elevation_rad", "torsion_rad"):
+                np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
+    plain = in_time(sequence={"duration_s": 1.0, "gaze": target, **still}).frames_at(0.2).pose
+    turned = np.degrees(moving.frames_at(1.0).pose.azimuth_rad - plain.azimuth_rad)
+    assert np.abs(turned).max() > 0.1  # of the optic axis, which the torsion carries around the line of sight
 
 
 def test_records_of_a_sequence_read_back_as_they_were_written():

@@ -11,10 +11,10 @@ from eyerender.scene.sequence.course import MovingEyes
 from eyerender.scene.sequence.habits import Habits
 from eyerender.scene.sequence.spec import Sequence
 
-TIMES = np.arange(20_000) * 1e-3
+TIMES = 1e-3 * np.arange(20_000, dtype=float)
 
 
-def aim(targets_mm, head_mm, eye):
+def aim(targets_mm, head_mm, torsion_rad, eye):
     """An eye at the side of the origin that turns about its apex."""
     gap = targets_mm - head_mm - np.array([0.0, 31.5 if eye else -31.5, 0.0])
     azimuth = np.arctan2(gap[:, 1], gap[:, 0])
@@ -69,7 +69,7 @@ def test_the_oscillation_solves_its_equation():
 
 def test_oscillation_displaces_gaze_by_a_fraction_of_a_degree_and_falls_with_the_size_of_saccades():
     """0.2 to 1 degree at 10 degrees (12 degrees of gaze per mm of the pupil), less at 30."""
-    peaks = {10.0: [], 30.0: []}
+    peaks: dict[float, list[float]] = {10.0: [], 30.0: []}
     for person in range(24):
         habits = Habits.drawn((person,))
         for amplitude, found in peaks.items():
@@ -101,7 +101,7 @@ def test_eyes_look_at_their_targets_between_saccades_and_converge_on_near_ones()
     states = course(gaze={"targets": [near, far], "oscillation": False, **QUIET}).at(TIMES)
     still = ~states.events[:, 2]
     for eye in (0, 1):
-        wanted = aim(states.target_mm, states.head_mm, eye)
+        wanted = aim(states.target_mm, states.head_mm, None, eye)
         np.testing.assert_allclose(states.azimuth_rad[still, eye], wanted[0][still], atol=1e-6)
         np.testing.assert_allclose(states.elevation_rad[still, eye], wanted[1][still], atol=1e-6)
     apart = np.degrees(states.azimuth_rad[still, 0] - states.azimuth_rad[still, 1])

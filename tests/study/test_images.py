@@ -47,7 +47,7 @@ def test_the_dataset_says_exactly_what_the_study_observes(study):
             shot.scene
             for scene in scenes
             for kind in kinds
-            for shot in Observing(kind).shots(scene, facing=study.facing, spp=4)
+            for shot in Observing(kind=kind).shots(scene, facing=study.facing, spp=4)
         ]
 
     wanted, quiet = wanted_by("image"), wanted_by("image-noiseless")
@@ -129,7 +129,7 @@ def test_images_are_made_once_and_a_part_of_them_serves_too(tmp_path):
 @pytest.mark.render
 @pytest.mark.slow
 def test_images_exposed_automatically_are_others_and_are_used_again(tmp_path):
-    """`tests/dataset/test_auto_exposure.py` holds the exposure itself."""
+    """`tests/dataset/test_functions.py` holds the exposure itself."""
     scenes = small_scenes()[2:4]
     alone = make_images("small", scenes, tmp_path / "alone", StudyOptions(workers=1))
     auto = tmp_path / "alone", StudyOptions(workers=1, auto_exposure=0.3)

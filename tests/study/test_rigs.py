@@ -62,4 +62,4 @@ def test_the_command_writes_the_study(tmp_path, capsys):
         assert all(later <= earlier * 1.001 for earlier, later in pairwise(noise)), row["layout"]
     assert len(list(csv.DictReader((folder / "who.csv").open()))) == 6 * 6 * 3
     assert run(["study", "rigs", "-o", str(folder), "--people", "0"]) == 2
-    assert run(["study", "guestrin2006", "-o", str(folder), "--people", "3"]) == 2
+    assert run(["study", "observers", "-o", str(folder), "--people", "3"]) == 2

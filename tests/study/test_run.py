@@ -197,12 +197,12 @@ BAD = [
     (["study", "guestrin2006", "-o", "out", "--observer", "mine"], 2, "--observer"),
     (["study", "conditions", "-o", "out", "--observer", "image"], 2, "needs 'analytic'"),
     (["study", "observers", "-o", "out", "--observer", "image"], 2, "needs 'both'"),
-    (["study", "guestrin2006", "-o", "out", "--people", "3"], 2, "draws no people"),
+    (["study", "observers", "-o", "out", "--people", "3"], 2, "draws no people"),
     (["study", "no_module:Study", "-o", "out"], 2, "there is no module 'no_module'"),
     (["study", "pathlib:Path", "-o", "out"], 2, "is not a subclass of eyerender.apps.Study"),
     (["study", "own:Own", "-o", "out", "--population", "giants", "--people", "2"], 2, "giants"),
     (["study", "own:Own", "-o", "out", "--population", "adults"], 2, "--people N"),
-    (["study", "own:Own", "-o", "out", "--people", "2", "--observer", "both"], 2, "ray optics only"),
+    (["study", "own:Own", "-o", "out", "--people", "2", "--image-people", "1"], 2, "an observer of images"),
     (["study", "guestrin2006", "-o", "out", "--noise", "some"], 2, "--noise"),
     (["study", "guestrin2006", "-o", "out", "--workers", "0"], 2, "--workers: must be >= 1"),
     (["study", "guestrin2006", "-o", "out", "--spp", "0"], 2, "--spp: must be >= 1"),
@@ -253,7 +253,7 @@ def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
     scene = guestrin.scene("E1", guestrin.CORRECTED)
     # The image part alone is replaced by the analytic one: what is tested is the order and the index.
     monkeypatch.setattr(StudyImages, "observe", lambda self, s, noise_seed=None: trace(s))
-    seen = Observing("image", StudyImages({})).observe(scene, facing=True)
+    seen = Observing(kind="image", images=StudyImages({})).observe(scene, facing=True)
     direct = trace(scene)
     for name in ("frame", "fixation", "head", "eye", "target_mm"):
         np.testing.assert_array_equal(getattr(seen.index, name), getattr(direct.index, name))
@@ -262,10 +262,8 @@ def test_turned_frames_come_back_in_the_scenes_order(monkeypatch):
 
 def test_images_that_are_not_there_are_refused():
     scene = guestrin.scene("E1", set())
-    with pytest.raises(InputError, match="needs images"):
-        Observing("image").observe(scene)
     with pytest.raises(InputError, match="not in the study's dataset"):
-        Observing("image", StudyImages({})).observe(scene)
+        Observing(kind="image", images=StudyImages({})).observe(scene)
 
 
 def test_known_feature_errors_and_paired_differences():

@@ -22,6 +22,22 @@ def test_the_page_has_the_tables_of_the_stored_results():
     assert script.page_with(page, script.tables(data)) == page, "run scripts/study_tables.py"
 
 
+def test_the_page_over_people_has_the_tables_of_the_stored_results():
+    data = json.loads(script.PEOPLE_DATA.read_text(encoding="utf-8"))
+    page = script.PEOPLE_PAGE.read_text(encoding="utf-8")
+    assert script.page_with(page, script.people_tables(data)) == page, "run scripts/study_tables.py"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", ["guestrin2006", "stereo"])
+def test_a_run_over_people_gives_the_stored_results(name, tmp_path):
+    """As many people as are stored, to four digits."""
+    stored = json.loads(script.PEOPLE_DATA.read_text(encoding="utf-8"))[name]
+    run_study(name, tmp_path / "out", people=stored["people"][0]["people"])
+    assert_same(script.people_of(tmp_path / "out")[name]["people"], stored["people"])
+
+
 def test_the_page_lists_every_sentence_with_its_rules():
     page = script.PAGE.read_text(encoding="utf-8")
     for rule in lit.RULES.values():

@@ -9,7 +9,7 @@ import numpy as np
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.parts import GridSpec, ZernikeSpec
 from eyerender.eye.spec import EyeSpec
-from eyerender.optics.zernike import fitted
+from eyerender.optics.surfaces_measured import fitted
 
 # The anterior cornea of the eye in the tests of visisipy (MIT; SyntEyes: Rozema et al. 2016, IOVS 57:683), order 8,
 # depths in mm on a disc of radius 3.25 mm.

@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "scripts"
 TOOLS = SCRIPTS / "tools"
 DATA = ROOT / "tests" / "data"
+BARE_HEAD_MOUNTED = str(DATA / "bare_head_mounted.yaml")  # the shipped scene as a bare globe
 
 
 def load(name: str) -> Any:

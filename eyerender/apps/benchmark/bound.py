@@ -35,23 +35,15 @@ _PRIOR_SLOPE, _PRIOR_SHIFT_PX, _PRIOR_LOG_SIGMA = 0.3, 0.5, 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Edge:
-    """The pupil's edge in an image.
+    """The pupil's edge in an image."""
 
-    Attributes:
-        noise_dn: standard deviation s of a pixel's noise, with rounding, DN.
-        step_dn: step from pupil to iris, DN.
-        sigma_px: width sigma_b of the blurred edge, with the pixel, px.
-        arc_deg: part of the outline along which the edge was measured, in degrees of the ellipse's parameter.
-        step_sd_dn: standard error of `step_dn`; 0 if the folder states the edge.
-        sigma_sd_px: standard error of `sigma_px`; 0 if the folder states the edge.
-    """
-
-    noise_dn: float
-    step_dn: float
-    sigma_px: float
+    noise_dn: float  # standard deviation s of a pixel's noise, with rounding, DN
+    step_dn: float  # step from pupil to iris, DN
+    sigma_px: float  # width sigma_b of the blurred edge, with the pixel, px
+    # part of the outline along which the edge was measured, in degrees of the ellipse's parameter
     arc_deg: float = 360.0
-    step_sd_dn: float = 0.0
-    sigma_sd_px: float = 0.0
+    step_sd_dn: float = 0.0  # standard error of `step_dn`; 0 if the folder states the edge
+    sigma_sd_px: float = 0.0  # standard error of `sigma_px`; 0 if the folder states the edge
 
     def centre_sigma_px(self, pupil: Ellipse) -> float:
         """Compute the standard deviation sigma_c per axis, px."""
@@ -84,16 +76,8 @@ def edge_of(
 ) -> Edge | None:
     """Return the edge as stated by the folder (`known`), or measured along the visible part of the true outline.
 
-    Args:
-        image: (h, w) as stored.
-        bit_depth: bits of the file.
-        pupil: the true outline; None if the image shows no pupil, and so no edge.
-        glints_px: (n, 2) positions to exclude.
-        known: noise, blur and step, if the folder states them.
-        shows: (h, w) pixels that show pupil or iris; None if unknown.
-
-    Returns:
-        The edge; None if nothing can be measured.
+    The image (h, w) is as stored. Positions `glints_px` (n, 2) are left out, and pixels where `shows` (h, w), which
+    says where pupil or iris are seen, does not hold. None if nothing can be measured.
     """
     if pupil is None:
         return None
@@ -117,20 +101,13 @@ def edge_of(
 def measure_edge(
     grey_dn: Floats, pupil: Ellipse, glints_px: Floats, quantum_dn: float = 0.0, shows: Bools | None = None
 ) -> Edge | None:
-    """Measure noise, step and blur along a known outline.
+    """Measure noise, step and blur along a known outline, without the glints and where `shows` (h, w) does not hold.
 
     The levels inside and outside are linear in the distance d from the outline, with an error function between them
     (robust least squares over |d| < 6 px, then over 5 sigma where the edge is wider). Weak priors on slopes, shift and
     width keep the fit of a short arc determined. The noise is half the rms of I(x, y) - I(x+1, y) - I(x, y+1) + I(x+1,
     y+1) away from the edge, clipped at 4 sigma; gradients cancel. Where fewer than 20 such differences exist, it is the
-    scatter of the pixels about the fitted edge.
-
-    Args:
-        grey_dn: (h, w) levels.
-        pupil: the outline.
-        glints_px: (n, 2) positions to exclude.
-        quantum_dn: smallest step of a stored value.
-        shows: (h, w) pixels to use, None for all.
+    scatter of the pixels about the fitted edge. `quantum_dn` is the smallest step of a stored value.
     """
     widest = 0.6 * float(pupil.semi_axes_px[1])
     reach = min(6.0, widest)

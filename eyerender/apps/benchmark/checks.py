@@ -72,11 +72,7 @@ class Requirement:
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
-    """Read results.json of an earlier benchmark.
-
-    Raises:
-        InputError: the file is not such a result.
-    """
+    """Read results.json of an earlier benchmark; InputError if the file is not such a result."""
     data = read_json(path, limit=_RESULTS_BYTES)
     if data.get("schema") != RESULTS_SCHEMA:
         raise InputError(f"is {shown(data.get('schema'))}; --against reads {RESULTS_SCHEMA!r}", source=str(path))

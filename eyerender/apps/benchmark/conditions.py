@@ -149,18 +149,10 @@ def tags(*found: set[str]) -> tuple[str, ...]:
 
 
 def balanced(conditions: Sequence[Sequence[str]], subjects: Sequence[str], share: float = 0.1) -> list[int]:
-    """Select a share of the images in which every condition is as frequent as in all images.
+    """Select a share of the images, rounded up, in which every condition is as frequent as in all: ascending rows.
 
     Images are added one at a time, so that the counts of conditions stay as close to the share as possible; among
     equals, the subject with the fewest images so far is preferred.
-
-    Args:
-        conditions: conditions of every image.
-        subjects: subject of every image.
-        share: share to choose, rounded up.
-
-    Returns:
-        Rows of the images, ascending.
     """
     has = np.array([[name in found for name in CONDITIONS] for found in conditions], dtype=np.float64)
     frequency = has.mean(axis=0)

@@ -30,13 +30,9 @@ _IRIS_RATIO = (1.4, 8.0)
 
 
 def kind_of(found: Ellipse, image: BenchImage, grey: NDArray[Any], mask: Bytes | None) -> FailureKind:
-    """Return the kind of a wrong ellipse: the first of `KINDS` that applies.
+    """Return the kind of a wrong ellipse in an image (h, w): the first of `KINDS` that applies.
 
-    Args:
-        found: the ellipse.
-        image: the labels of the image.
-        grey: (h, w) pixels of the image.
-        mask: (h, w) classes of the pixels; None if unknown, when lids are known only by their margins.
+    Without classes of the pixels (`mask`), lids are known only by their margins.
     """
     true = image.pupil
     if true is not None and iou(found, true) >= _NEAR:

@@ -34,13 +34,7 @@ def load_labelled(
     eye_error_mm: float = EYE_ERROR_MM,
     pupil_class: int | None = None,
 ) -> list[BenchImage]:
-    """Load every image of a folder.
-
-    Args:
-        folder: the folder.
-        gamma: encoding gamma of images whose folder states none; None assumes 1.
-        eye_error_mm: standard deviation, per axis, of the error of the eye position given to extractors.
-        pupil_class: value of the pupil in masks of several classes.
+    """Load every image of a folder; options as in `BenchOptions`.
 
     Raises:
         InputError: the folder is of another kind; an image is missing, has another size or does not show exactly one

@@ -31,34 +31,21 @@ _REACH_PX, _EDGE_PX, _MARGIN_PX = 12, 3.0, 4.0
 
 @dataclass(frozen=True, slots=True)
 class GlintLook:
-    """Appearance of a glint in the image.
+    """Appearance of a glint in the image."""
 
-    Attributes:
-        radius_px: radius of a disc with the area of its pixels above half of its peak; 0 if not measured.
-        saturated: whether one of its pixels is at full scale; None if unknown.
-        place: part of the eye behind it; "" if unknown.
-    """
-
-    radius_px: float = 0.0
-    saturated: bool | None = None
-    place: Place = ""
+    radius_px: float = 0.0  # radius of a disc with the area of its pixels above half of its peak; 0 if not measured
+    saturated: bool | None = None  # whether one of its pixels is at full scale; None if unknown
+    place: Place = ""  # part of the eye behind it; "" if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class TrueGlint:
-    """A glint that the image shows.
+    """A glint that the image shows."""
 
-    Attributes:
-        light: its light, -1 if unknown.
-        xy_px: its position in px of the image.
-        visible: visible share.
-        look: size, saturation and place, as far as they are measured.
-    """
-
-    light: int
-    xy_px: tuple[float, float]
-    visible: float = 1.0
-    look: GlintLook = GlintLook()
+    light: int  # its light, -1 if unknown
+    xy_px: tuple[float, float]  # its position in px of the image
+    visible: float = 1.0  # visible share
+    look: GlintLook = GlintLook()  # size, saturation and place, as far as they are measured
 
     def __post_init__(self) -> None:
         """Refuse positions that no image has, with `ValueError`."""
@@ -75,15 +62,7 @@ class TrueGlint:
 def measured(
     glints: Sequence[TrueGlint], grey: NDArray[Any], bit_depth: int, pupil: Ellipse | None, mask: Bytes | None
 ) -> tuple[TrueGlint, ...]:
-    """Measure size, saturation and place of glints.
-
-    Args:
-        glints: the glints.
-        grey: (h, w) the image.
-        bit_depth: its bits.
-        pupil: the true outline.
-        mask: (h, w) classes of the pixels; None if unknown.
-    """
+    """Measure size, saturation and place of glints in an image (h, w), given the pupil and, if known, the classes."""
     full = np.inf if grey.dtype.kind == "f" else 2**bit_depth - 1
     out = []
     for glint in glints:
@@ -125,14 +104,7 @@ def _place(xy: tuple[float, float], pupil: Ellipse | None, mask: Bytes | None) -
 
 
 def false_kind(xy: tuple[float, float], true: Sequence[TrueGlint], hidden_px: Floats, mask: Bytes | None) -> str:
-    """Classify a report that matches no glint: the first of `FALSE_KINDS` that applies.
-
-    Args:
-        xy: its position.
-        true: glints that the image shows.
-        hidden_px: (n, 2) positions of hidden glints.
-        mask: (h, w) classes of the pixels; None if unknown.
-    """
+    """Classify a report that matches no glint, seen or hidden (n, 2): the first of `FALSE_KINDS` that applies."""
     if any(math.hypot(xy[0] - g.xy_px[0], xy[1] - g.xy_px[1]) < g.match_px for g in true):
         return "repeated"
     if len(hidden_px) and np.hypot(*(hidden_px - xy).T).min() < MATCH_PX:

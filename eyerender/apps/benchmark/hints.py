@@ -14,7 +14,7 @@ from ...rig.distortion import Distortion
 
 HINTS = "hints.json"
 HINTS_SCHEMA = "eyerender/hints/1"
-NO_HINTS: dict[str, Any] = {"polarity": "auto", "gamma": 1.0, "radius_px": None, "rig": None}
+NO_HINTS: dict[str, Any] = {"polarity": "auto", "gamma": 1.0, "radius_px": None, "rig": None, "prior": None}
 """Hints of a request about an image of which nothing is known."""
 
 
@@ -75,4 +75,4 @@ class FolderHints(Spec):
         """Return the hints of a request; an unknown gamma becomes 1."""
         rig = None if self.rig is None else self.rig.model_dump(mode="json")
         radius = None if self.radius_px is None else list(self.radius_px)
-        return {"polarity": self.polarity, "gamma": self.gamma or 1.0, "radius_px": radius, "rig": rig}
+        return {"polarity": self.polarity, "gamma": self.gamma or 1.0, "radius_px": radius, "rig": rig, "prior": None}

@@ -15,19 +15,12 @@ _SEED = 20_001
 
 
 def wilson(part: float, whole: float, quantile: float | None = None) -> tuple[float, float] | None:
-    """Compute Wilson's score interval of a share.
+    """Compute Wilson's score interval of a share; None without trials.
 
         (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n),   p = part / whole, n = whole
 
-    Source: Wilson (1927); Brown, Cai and DasGupta (2001), eq. 4.
-
-    Args:
-        part: number of successes.
-        whole: number of trials; it may be an effective number.
-        quantile: z, by default that of a 95 % interval, 1.96.
-
-    Returns:
-        Lower and upper end; None without trials.
+    n may be an effective number of trials; the quantile z is by default that of a 95 % interval, 1.96. Source: Wilson
+    (1927); Brown, Cai and DasGupta (2001), eq. 4.
     """
     from scipy.special import ndtri
 
@@ -48,15 +41,8 @@ def subject_interval(
     The bootstrap over subjects gives the variance of the share, and thereby the effective number of trials, which is n
     p (1 - p) / (n variance) but not above n. Wilson's interval with that number and Student's quantile for the number
     of subjects is never empty, unlike the bootstrap's percentiles, which are [1, 1] if all trials succeeded. In that
-    case the variance is unknown, and every subject counts as one trial.
-
-    Args:
-        parts: successes of each image.
-        wholes: trials of each image.
-        subjects: subject of each image.
-
-    Returns:
-        Lower and upper end; None if fewer than two subjects have trials.
+    case the variance is unknown, and every subject counts as one trial. `parts`, `wholes` and `subjects` are those of
+    each image. None if fewer than two subjects have trials.
     """
     from scipy.special import stdtrit
 
@@ -77,13 +63,9 @@ def subject_interval(
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Compute the two-sided p value of the exact McNemar test.
+    """Compute the two-sided p value of the exact McNemar test of images on which only one of two extractors succeeds.
 
-    If both extractors are equally good, each image on which exactly one succeeds is the first's with probability 1/2.
-
-    Args:
-        only_first: number of images on which only the first succeeds.
-        only_second: number of images on which only the second succeeds.
+    If both are equally good, each of these images is the first's with probability 1/2.
     """
     from scipy.stats import binomtest
 

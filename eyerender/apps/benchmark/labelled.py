@@ -20,53 +20,33 @@ from .glintlabels import TrueGlint
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BenchImage:
-    """One image of one eye; positions are relative to the image, with pixel centres at integers.
+    """One image of one eye; positions are relative to the image, with pixel centres at integers."""
 
-    Attributes:
-        name: name of the image.
-        path: file.
-        bit_depth: bits of the file.
-        size: (width, height).
-        pupil: None where the image shows none, or only its centre is known.
-        outline_px: (n, 2) outline of the pupil.
-        visible: visible share of the pupil; None if unknown.
-        glints: glints that the image shows.
-        hints: information given to extractors.
-        known: noise (DN), blur (px) and step (DN), if the folder states them.
-        factors: possible causes of an error, by name.
-        subject: the person; if "" (unknown), each image counts as a separate subject.
-        iris: outline of the iris; None if unknown.
-        lids_px: (n, 2) margins of the lids, as far as they are known.
-        mask_path: file of the classes of the pixels; None if unknown.
-        hidden_glints_px: positions of glints that are hidden in the image.
-        conditions: hard conditions (`conditions.CONDITIONS`).
-        centre_px: (x, y) of a pupil of which only the centre is known.
-        gamma_from: where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`).
-        edge: the pupil's edge (`bound`); None if it is unknown.
-        sigma_px: bound of the centre's standard deviation per axis; None where it does not apply.
-    """
-
-    name: str
-    path: Path
-    bit_depth: int
-    size: tuple[int, int]
-    pupil: Ellipse | None = None
-    outline_px: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    visible: float | None = None
-    glints: tuple[TrueGlint, ...] = ()
-    hints: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # name of the image
+    path: Path  # file
+    bit_depth: int  # bits of the file
+    size: tuple[int, int]  # (width, height)
+    pupil: Ellipse | None = None  # None where the image shows none, or only its centre is known
+    outline_px: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # (n, 2) outline of the pupil
+    visible: float | None = None  # visible share of the pupil; None if unknown
+    glints: tuple[TrueGlint, ...] = ()  # glints that the image shows
+    hints: Mapping[str, Any] = field(default_factory=dict)  # information given to extractors
+    # noise (DN), blur (px) and step (DN), if the folder states them
     known: Mapping[str, float] = field(default_factory=dict)
-    factors: Mapping[str, float] = field(default_factory=dict)
+    factors: Mapping[str, float] = field(default_factory=dict)  # possible causes of an error, by name
+    # where the gamma of the hints comes from: the folder, an option (`given`), or nowhere (`assumed`)
     gamma_from: str = "folder"
-    subject: str = ""
-    iris: Ellipse | None = None
-    lids_px: tuple[Floats, ...] = ()
-    mask_path: Path | None = None
-    conditions: tuple[str, ...] = ()
-    hidden_glints_px: tuple[tuple[float, float], ...] = ()
-    centre_px: tuple[float, float] | None = None
-    edge: Edge | None = None
-    sigma_px: float | None = None
+    subject: str = ""  # the person; if "" (unknown), each image counts as a separate subject
+    iris: Ellipse | None = None  # outline of the iris; None if unknown
+    lids_px: tuple[Floats, ...] = ()  # (n, 2) margins of the lids, as far as they are known
+    mask_path: Path | None = None  # file of the classes of the pixels; None if unknown
+    conditions: tuple[str, ...] = ()  # hard conditions (`conditions.CONDITIONS`)
+    hidden_glints_px: tuple[tuple[float, float], ...] = ()  # positions of glints that are hidden in the image
+    centre_px: tuple[float, float] | None = None  # (x, y) of a pupil of which only the centre is known
+    edge: Edge | None = None  # the pupil's edge (`bound`); None if it is unknown
+    sigma_px: float | None = None  # bound of the centre's standard deviation per axis; None where it does not apply
+    recording: str = ""  # what the frames of one eye, seen by one camera, share
+    time_s: float | None = None  # time of the frame in its recording; None outside sequences
 
     @classmethod
     def read(
@@ -74,12 +54,7 @@ class BenchImage:
     ) -> BenchImage:
         """Read size and bit depth of an image of which the labels alone are known, no camera and no lights.
 
-        Args:
-            name: name of the image.
-            path: file.
-            pupil: its outline; a pupil of which nothing is visible is not shown.
-            visible: visible share of the pupil.
-            labels: further attributes.
+        A pupil of which nothing is visible (share 0) is not shown; `labels` are further attributes.
         """
         image, depth, _ = read_any_image(path)
         height, width = image.shape

@@ -36,15 +36,10 @@ _SURE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class NetworkExtractor:
-    """An extractor that runs a network (`protocol.Extractor`).
+    """An extractor that runs a network (`protocol.Extractor`)."""
 
-    Attributes:
-        session: the `onnxruntime.InferenceSession`.
-        size: (width, height) of the pictures that the network takes.
-    """
-
-    session: Any
-    size: tuple[int, int]
+    session: Any  # the `onnxruntime.InferenceSession`
+    size: tuple[int, int]  # (width, height) of the pictures that the network takes
     conventions: ClassVar[dict[str, str]] = {"angle_of": "first"}
     reports: ClassVar[tuple[str, ...]] = ("pupil",)
 

@@ -48,11 +48,7 @@ def is_own(folder: Path) -> bool:
 
 
 def own_images(folder: Path, pupil_class: int | None = None) -> Iterator[BenchImage]:
-    """Yield every image with its labels.
-
-    Args:
-        folder: the folder.
-        pupil_class: value of the pupil in masks of several classes.
+    """Yield every image with its labels; `pupil_class` is the value of the pupil in masks of several classes.
 
     Raises:
         InputError: a table or mask cannot be used, or names a missing image; or masks have several classes and

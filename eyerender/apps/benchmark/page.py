@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...optics.ellipse import Ellipse
 from ...report.page import Card, Figure, Page, Section, Table, number, write_page
 from ...report.style import TARGET, error_panel, figure, legend_above, log_scale, svg
+from .recordings import EVENTS
 
 Row = dict[str, Any]
 Format = Callable[[Any], str]
@@ -76,6 +77,7 @@ def write_bench_report(path: Path, data: Row, rows: Sequence[Row], thumbnails: S
             "seen, the answer that there is none is right.",
             _condition_table(data),
         ),
+        *([_time_section(entries)] if any(entry["time"] for entry in entries) else []),
         Section("Failures", *_thumbnail_figures(thumbnails), _failure_table(entries), _not_run_table(data)),
         Section("How this was made", *_how(data), _convention_table(entries)),
     ]
@@ -383,6 +385,23 @@ def _condition_table(data: Row) -> Table:
             rows.append((name, condition["what"], str(len(condition["images"])), *shares))
     header = ("condition", "what", "images", *(e["name"] for e in data["extractors"]))
     return Table(header, rows, "Right answers by condition", wide=(1,))
+
+
+def _time_section(entries: Sequence[Row]) -> Section:
+    """Return delay and losses of the extractors on frames in time; `times.json` has their processor time."""
+    every = [entry["time"] for entry in entries]
+    rows = []
+    for entry, found in zip(entries, every, strict=True):
+        losses = [found["loss"].get(name) for name in EVENTS]
+        shares = ["-" if loss is None else f"{_percent(loss['share'])} of {loss['with_pupil']}" for loss in losses]
+        rows.append((entry["name"], number(found["delay_ms"]), *shares))
+    return Section(
+        "In time",
+        f"{every[0]['frames']} frames of {every[0]['recordings']} recordings. Extractors are told the pupil that they "
+        "found last. Delay: by how much the answers around saccades follow the truth, ms. Loss: frames that show a "
+        "pupil and have no ellipse, by event.",
+        Table(("extractor", "delay, ms", *EVENTS), rows, "Delay and losses."),
+    )
 
 
 def _pair_table(pairs: Sequence[Row]) -> Table:

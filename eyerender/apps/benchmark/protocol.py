@@ -9,14 +9,17 @@ Every line is one object. The greeting comes once, then an answer to each reques
 input. The record is the package's (eyerender/record/3). Only `pupil.status` is required, and with "ok" centre, axes and
 angle: either `semi_axes_px` and `angle_rad`, whose names define them, or `axes_px` and `angle` as `conventions`
 declares. Places are relative to the image.
+
+This package: pixel centres at integers, x right, y down, semi-axes a >= b, angle of a from +x toward +y in [0, pi).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, Protocol, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +27,86 @@ from numpy.typing import NDArray
 from ...base.errors import InputError, one_line
 from ...base.storage.files import shown
 from ...optics.ellipse import Ellipse
-from .conventions import Conventions, number, pair
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conventions:
+    """Conventions of an extractor for positions, axes and angles; the defaults are this package's.
+
+    OpenCV's rotated rectangle is full, deg, first, down, centre.
+    """
+
+    # meaning of (0, 0): the centre of the first pixel, or its outer corner (the centre is then (.5, .5))
+    pixel_origin: Literal["centre", "corner"] = "centre"
+    axes: Literal["semi", "full"] = "semi"  # semi-axes or full ones
+    angle_unit: Literal["rad", "deg"] = "rad"  # unit of the angle
+    # the axis to which the angle belongs: the major one, the minor one, or the first of the two
+    angle_of: Literal["major", "minor", "first"] = "major"
+    # direction from +x that counts as positive: toward +y, down the image ("down"), or up
+    angle_toward: Literal["down", "up"] = "down"
+
+    @classmethod
+    def of(cls, stated: object) -> Conventions:
+        """Create conventions from a mapping of some of the names above; InputError if a name or a value is unknown."""
+        if isinstance(stated, Conventions):
+            return stated
+        if stated is None:
+            return cls()
+        if not isinstance(stated, Mapping):
+            raise InputError("must be an object", path="conventions")
+        kinds = get_type_hints(cls)
+        known = [f.name for f in fields(cls)]
+        for name, value in stated.items():
+            if name not in known:
+                raise InputError(f"unknown; there are {', '.join(known)}", path=f"conventions.{name}")
+            if value not in get_args(kinds[name]):
+                raise InputError(
+                    f"must be one of {', '.join(get_args(kinds[name]))}, not {value!r}", path=f"conventions.{name}"
+                )
+        return cls(**stated)
+
+    def to_mapping(self) -> dict[str, str]:
+        """Convert to a mapping for JSON."""
+        return asdict(self)
+
+    def point(self, xy: Sequence[float]) -> tuple[float, float]:
+        """Convert a position in the image to px."""
+        shift = 0.5 if self.pixel_origin == "corner" else 0.0
+        return xy[0] - shift, xy[1] - shift
+
+    def ellipse(self, centre: Sequence[float], axes: Sequence[float], angle: float) -> Ellipse:
+        """Convert an ellipse to centre, semi-axes (px) and angle (rad) of this package.
+
+        Raises:
+            InputError: an axis is not positive, or a number is not finite.
+        """
+        first, second = axes
+        if (self.angle_of == "major" and second > first) or (self.angle_of == "minor" and second < first):
+            first, second = second, first
+        half = 0.5 if self.axes == "full" else 1.0
+        turn = math.radians(angle) if self.angle_unit == "deg" else angle
+        turn = -turn if self.angle_toward == "up" else turn
+        return Ellipse(self.point(centre), (half * first, half * second), turn)  # type: ignore[arg-type]
+
+
+OPENCV = Conventions(axes="full", angle_unit="deg", angle_of="first")
+
+
+def number(value: Any, path: str, limit: float = 1e6) -> float:
+    """Parse a finite number of plausible size; InputError naming the path."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"must be a number, not {shown(value, 40)}", path=path)
+    if abs(value) > limit or not math.isfinite(value):  # in this order, because an integer may be too large for a float
+        raise InputError(f"must be a finite number within {limit:g}, not {shown(value, 40)}", path=path)
+    return float(value)
+
+
+def pair(value: Any, path: str) -> tuple[float, float]:
+    """Parse two numbers; InputError naming the path."""
+    if isinstance(value, str | Mapping) or not isinstance(value, Sequence) or len(value) != 2:
+        raise InputError(f"must be two numbers, not {shown(value, 40)}", path=path)
+    return number(value[0], f"{path}.0"), number(value[1], f"{path}.1")
+
 
 SCHEMA = "eyerender/extractor/1"
 FEATURES = ("pupil", "glints")
@@ -51,19 +133,13 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """Self-description of an extractor.
+    """Self-description of an extractor."""
 
-    Attributes:
-        name: its name and version.
-        conventions: the meaning of its numbers.
-        reports: the features that it detects.
-        warms_up: whether its first answer takes longer, because it loads libraries or compiles; the time limit of the
-            start is then added for that answer.
-    """
-
-    name: str
-    conventions: Conventions
-    reports: tuple[str, ...]
+    name: str  # its name and version
+    conventions: Conventions  # the meaning of its numbers
+    reports: tuple[str, ...]  # the features that it detects
+    # whether its first answer takes longer, because it loads libraries or compiles; the time limit of the start is then
+    # added for that answer
     warms_up: bool = False
 
     @classmethod
@@ -102,27 +178,16 @@ class Request:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """Answer of an extractor, in this package's conventions.
+    """Answer of an extractor, in this package's conventions."""
 
-    Attributes:
-        ellipse: the pupil; None if it found none.
-        reason: why it found none.
-        confidence: its confidence, if reported.
-        glints: ((x, y), light or None) in px.
-        cpu_s: processor time, if reported.
-        wall_s: elapsed time, if reported.
-        error: why it failed on this image, in its own words; the rest is then empty.
-        line: the answer as it was sent.
-    """
-
-    ellipse: Ellipse | None = None
-    reason: str | None = None
-    confidence: float | None = None
-    glints: tuple[tuple[tuple[float, float], int | None], ...] = ()
-    cpu_s: float | None = None
-    wall_s: float | None = None
-    error: str | None = None
-    line: str = ""
+    ellipse: Ellipse | None = None  # the pupil; None if it found none
+    reason: str | None = None  # why it found none
+    confidence: float | None = None  # its confidence, if reported
+    glints: tuple[tuple[tuple[float, float], int | None], ...] = ()  # ((x, y), light or None) in px
+    cpu_s: float | None = None  # processor time, if reported
+    wall_s: float | None = None  # elapsed time, if reported
+    error: str | None = None  # why it failed on this image, in its own words; the rest is then empty
+    line: str = ""  # the answer as it was sent
 
     @classmethod
     def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:

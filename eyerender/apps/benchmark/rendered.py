@@ -34,11 +34,7 @@ _RADIUS_MM = (0.6, 5.0)
 
 
 def rendered_images(folder: Path, eye_error_mm: float) -> list[BenchImage]:
-    """Read a rendered folder.
-
-    Args:
-        folder: the folder.
-        eye_error_mm: standard deviation, per axis, of the error of the eye position given to extractors.
+    """Read a rendered folder; `eye_error_mm` as in `BenchOptions`.
 
     Raises:
         InputError: the folder cannot be read, or an image does not show exactly one eye.
@@ -111,6 +107,8 @@ def _rendered(entry: ImageEntry, truth: Observations, row: int) -> BenchImage:
         mask_path=entry.mask_path,
         conditions=tuple(of_scene(entry.line, ellipse, corner) | of_events(entry.records[0])),
         hidden_glints_px=tuple(hidden),
+        recording=f"{entry.line.get('subject')} {truth.index.camera[row]} {truth.index.eye[row]}",
+        time_s=None if entry.line.get("time_s") is None else float(entry.line["time_s"]),
     )
 
 
@@ -198,11 +196,7 @@ def is_ideal(folder: Path) -> bool:
 
 
 def ideal_images(folder: Path) -> list[BenchImage]:
-    """Read a folder of ideal images.
-
-    Raises:
-        InputError: a line is not a record of such an image, or there is none.
-    """
+    """Read a folder of ideal images; InputError if a line is not a record of such an image, or there is none."""
     source = str(folder / METADATA)
     lines = JsonLines.index(folder / METADATA)
     out = []

@@ -17,10 +17,10 @@ import numpy as np
 
 from ...backends.probe import cpu_name
 from .asking import ExtractorResults
-from .curves import curves_of
 from .labelled import BenchImage
+from .recordings import in_time
 from .score import Score
-from .summary import FACTORS, breakdown, by_condition, failures, sizes, summarise
+from .summary import FACTORS, breakdown, by_condition, curves_of, failures, sizes, summarise
 
 TIMES_SCHEMA = "eyerender/bench-times/1"
 _ORIGIN = (
@@ -32,8 +32,8 @@ _LEAST_FOR_ORIGIN = 8
 _EDGE_COLUMNS = ("edge_arc_deg", "edge_step_error", "edge_width_error")
 
 
-def entry_of(run: ExtractorResults) -> dict[str, Any]:
-    """Return the results of one extractor."""
+def entry_of(run: ExtractorResults, images: Sequence[BenchImage]) -> dict[str, Any]:
+    """Return the results of one extractor on images."""
     greeting = run.greeting
     return {
         "name": run.extractor.name,
@@ -45,6 +45,7 @@ def entry_of(run: ExtractorResults) -> dict[str, Any]:
         "suggested_origin": suggested_origin(run),
         "breakdown": breakdown(run.scores),
         "conditions": by_condition(run.scores),
+        "time": in_time(images, run.scores),
         "curves": curves_of(run.scores),
         "failures": failures(run.scores),
         "answers": [

@@ -15,8 +15,7 @@ from ...base.storage.files import csv_text, write_json, write_text
 from ...base.storage.lock import LOCK
 from ...folders.imagefolder import STAGE, versions
 from ...folders.outfolder import MARKER, refuse_non_empty, staged
-from .answers import ANSWERS, Answers, code_digest, image_key, task_of
-from .asking import ExtractorResults, ask_extractors
+from .asking import ANSWERS, Answers, ExtractorResults, ask_extractors, code_digest, image_key, task_of
 from .checks import RESULTS_SCHEMA, Requirement, compare_with, problems_of, read_results
 from .conditions import CONDITIONS, balanced
 from .failurekinds import KINDS, kind_of
@@ -144,7 +143,7 @@ def _scored(runs: Sequence[ExtractorResults], images: Sequence[BenchImage], keys
             name: {"what": what, "images": [i.name for i in images if name in i.conditions]}
             for name, what in CONDITIONS.items()
         },
-        "extractors": [entry_of(run) for run in runs],
+        "extractors": [entry_of(run, images) for run in runs],
         "common": common_errors(runs),
         "pairs": pairs_of(runs),
     }

@@ -24,27 +24,17 @@ RIGHT_PX = 5.0  # the limit that the authors of sets with centres only use
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GlintScore:
-    """Scores of an image's glints.
+    """Scores of an image's glints."""
 
-    Attributes:
-        true: number of glints that the image shows.
-        reported: number of glints that the extractor reported.
-        errors_px: (dx, dy) of every match.
-        matches: whether each true glint is matched, with its visible share, saturation and place.
-        false_kinds: kinds of the reports that match none.
-        unnamed: number of matches without a light, in images whose lights are known.
-        named: number of matches for which the extractor named a light.
-        swapped: number of matches for which it named the wrong light.
-    """
-
-    true: int = 0
-    reported: int = 0
-    errors_px: tuple[tuple[float, float], ...] = ()
-    named: int = 0
-    swapped: int = 0
+    true: int = 0  # number of glints that the image shows
+    reported: int = 0  # number of glints that the extractor reported
+    errors_px: tuple[tuple[float, float], ...] = ()  # (dx, dy) of every match
+    named: int = 0  # number of matches for which the extractor named a light
+    swapped: int = 0  # number of matches for which it named the wrong light
+    # whether each true glint is matched, with its visible share, saturation and place
     matches: tuple[tuple[bool, TrueGlint], ...] = ()
-    false_kinds: tuple[str, ...] = ()
-    unnamed: int = 0
+    false_kinds: tuple[str, ...] = ()  # kinds of the reports that match none
+    unnamed: int = 0  # number of matches without a light, in images whose lights are known
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,54 +42,30 @@ class Score:
     """Score of one extractor on one image.
 
     The errors are None without an ellipse.
-
-    Attributes:
-        outcome: see `Outcome`.
-        reason: why there is no ellipse.
-        offset_px: (dx, dy) reported minus true centre.
-        axes_px: (da, db) reported minus true semi-axes.
-        angle_deg: reported minus true angle, in (-90, 90].
-        iou: overlap of the ellipses.
-        boundary_px: mean distance of the true outline from the reported ellipse (Sampson).
-        confidence: confidence of the extractor.
-        glints: scores of the glints.
-        cpu_s: processor time that the extractor reports.
-        wall_s: elapsed time that the extractor reports.
-        trip_s: time from request to answer.
-        ellipse: the reported ellipse.
-        with_pupil: whether the image shows a pupil.
-        subject: the person; "" if unknown.
-        kind: what a wrong ellipse shows instead of the pupil (`failurekinds`).
-        radius_px: sqrt(a b) of the true pupil.
-        by_centre: whether only the centre of the true pupil is known.
-        image: name of the image.
-        sigma_px: bound of the centre's standard deviation per axis; None where it does not apply.
-        factors: possible causes of an error, by name.
-        conditions: hard conditions of the image.
     """
 
-    outcome: Outcome
-    reason: str | None = None
-    offset_px: tuple[float, float] | None = None
-    axes_px: tuple[float, float] | None = None
-    angle_deg: float | None = None
-    iou: float | None = None
-    boundary_px: float | None = None
-    confidence: float | None = None
-    glints: GlintScore | None = None
-    cpu_s: float | None = None
-    wall_s: float | None = None
-    trip_s: float | None = None
-    ellipse: Ellipse | None = None
-    with_pupil: bool = True
-    subject: str = ""
-    kind: str | None = None
-    radius_px: float | None = None
-    by_centre: bool = False
-    image: str = ""
-    sigma_px: float | None = None
-    factors: Mapping[str, float] = field(default_factory=dict)
-    conditions: tuple[str, ...] = ()
+    outcome: Outcome  # see `Outcome`
+    reason: str | None = None  # why there is no ellipse
+    offset_px: tuple[float, float] | None = None  # (dx, dy) reported minus true centre
+    axes_px: tuple[float, float] | None = None  # (da, db) reported minus true semi-axes
+    angle_deg: float | None = None  # reported minus true angle, in (-90, 90]
+    iou: float | None = None  # overlap of the ellipses
+    boundary_px: float | None = None  # mean distance of the true outline from the reported ellipse (Sampson)
+    confidence: float | None = None  # confidence of the extractor
+    glints: GlintScore | None = None  # scores of the glints
+    cpu_s: float | None = None  # processor time that the extractor reports
+    wall_s: float | None = None  # elapsed time that the extractor reports
+    trip_s: float | None = None  # time from request to answer
+    ellipse: Ellipse | None = None  # the reported ellipse
+    with_pupil: bool = True  # whether the image shows a pupil
+    subject: str = ""  # the person; "" if unknown
+    kind: str | None = None  # what a wrong ellipse shows instead of the pupil (`failurekinds`)
+    radius_px: float | None = None  # sqrt(a b) of the true pupil
+    by_centre: bool = False  # whether only the centre of the true pupil is known
+    image: str = ""  # name of the image
+    sigma_px: float | None = None  # bound of the centre's standard deviation per axis; None where it does not apply
+    factors: Mapping[str, float] = field(default_factory=dict)  # possible causes of an error, by name
+    conditions: tuple[str, ...] = ()  # hard conditions of the image
 
     @property
     def centre_px(self) -> float | None:

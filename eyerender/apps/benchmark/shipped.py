@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...base.status import Status
 from ...base.storage.cachefolder import cache_folder
 from ...extraction import FAST, REFINED, Extraction, ExtractionSettings, extract, identify
+from ...extraction.result import PupilResult
+from ...optics.ellipse import Ellipse
 from ...rig.camera import PinholeCamera
 from .registry import Command
 
@@ -101,7 +104,12 @@ def _own(settings: ExtractionSettings, image: NDArray[Any], request: Mapping[str
         changes |= dict(zip(("radius_min_px", "radius_max_px"), hints["radius_px"], strict=True))
     # A float image has a free scale.
     depth = None if image.dtype.kind == "f" else request["bit_depth"]
-    found = extract(image, bit_depth=depth, gamma=hints["gamma"], settings=settings.model_copy(update=changes))
+    prior = hints.get("prior")
+    if prior is not None:
+        ellipse = Ellipse(prior["centre_px"], prior["semi_axes_px"], prior["angle_rad"])
+        prior = PupilResult(status=Status.OK, ellipse=ellipse, bright=hints["polarity"] == "bright")
+    own = settings.model_copy(update=changes)
+    found = extract(image, bit_depth=depth, gamma=hints["gamma"], settings=own, prior=prior)
     pupil, lights = found.pupil, _lights(found, hints["rig"])
     out: dict[str, Any] = {
         "status": "ok" if pupil.ok else "missing",

@@ -22,8 +22,7 @@ import numpy as np
 from ...base.errors import InputError
 from ...base.references import load_reference
 from ...folders.imagefile import read_any_image
-from .conventions import Conventions
-from .protocol import FEATURES, SCHEMA, Extractor
+from .protocol import FEATURES, SCHEMA, Conventions, Extractor
 from .registry import PREFIX, Command
 
 

@@ -24,21 +24,13 @@ _DEALS = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shift:
-    """Difference of one number in two datasets.
+    """Difference of one number in two datasets."""
 
-    Attributes:
-        column: its name.
-        distance: of Kolmogorov and Smirnov.
-        chance: distance that chance exceeds in 5 % of cases.
-        medians: of both datasets.
-        counts: subjects that have the number in both; images where a dataset has less than two subjects.
-    """
-
-    column: str
-    distance: float
-    chance: float
-    medians: tuple[float, float]
-    counts: tuple[int, int]
+    column: str  # its name
+    distance: float  # of Kolmogorov and Smirnov
+    chance: float  # distance that chance exceeds in 5 % of cases
+    medians: tuple[float, float]  # of both datasets
+    counts: tuple[int, int]  # subjects that have the number in both; images where a dataset has less than two subjects
 
 
 def shifts(first: Contents, second: Contents) -> list[Shift]:

@@ -14,10 +14,9 @@ from .dependence import Dependence
 from .duplicates import SimilarPair
 from .faults import KINDS
 from .missing import MissingLabels
-from .outliers import Outlier
+from .outliers import Outlier, WorstPicture
 from .reading import Contents
 from .statistics import Distribution, strongest
-from .worst import WorstPicture
 
 _LISTED = 100  # images of each kind of fault in the JSON
 _PAIRS = 40
@@ -25,34 +24,20 @@ _PAIRS = 40
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """What was found in one dataset.
+    """What was found in one dataset."""
 
-    Attributes:
-        contents: what was read.
-        splits: split -> number of images and set of subjects.
-        shared: subject -> splits, of subjects in more than one.
-        equal: places of pictures with the same pixels, by groups.
-        near: pairs of near-duplicates.
-        outliers: the most unusual images.
-        worst: the worst pictures by simple figures.
-        distributions: of each column.
-        correlated: names of the columns that vary, and (m, m) their rank correlations.
-        missing: labels that more than 2 % of the images lack.
-        shares: of the images, in ranges of what matters to training.
-        dependences: pairs of draws and labels that depend on each other; None if there are too few subjects to test.
-    """
-
-    contents: Contents
-    splits: dict[str, tuple[int, set[int]]]
-    shared: dict[int, list[str]]
-    equal: list[list[int]]
-    near: list[SimilarPair]
-    outliers: list[Outlier]
-    worst: list[WorstPicture]
-    distributions: dict[str, Distribution]
-    correlated: tuple[list[str], Floats]
-    missing: list[MissingLabels]
-    shares: dict[str, dict[str, float]]
+    contents: Contents  # what was read
+    splits: dict[str, tuple[int, set[int]]]  # split -> number of images and set of subjects
+    shared: dict[int, list[str]]  # subject -> splits, of subjects in more than one
+    equal: list[list[int]]  # places of pictures with the same pixels, by groups
+    near: list[SimilarPair]  # pairs of near-duplicates
+    outliers: list[Outlier]  # the most unusual images
+    worst: list[WorstPicture]  # the worst pictures by simple figures
+    distributions: dict[str, Distribution]  # of each column
+    correlated: tuple[list[str], Floats]  # names of the columns that vary, and (m, m) their rank correlations
+    missing: list[MissingLabels]  # labels that more than 2 % of the images lack
+    shares: dict[str, dict[str, float]]  # of the images, in ranges of what matters to training
+    # pairs of draws and labels that depend on each other; None if there are too few subjects to test
     dependences: list[Dependence] | None
 
     @property

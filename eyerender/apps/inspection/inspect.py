@@ -18,12 +18,11 @@ from .duplicates import equal_pictures, near_duplicates
 from .faults import KINDS, Fault
 from .found import Inspection
 from .missing import missing_labels
-from .outliers import outliers
+from .outliers import outliers, worst_pictures
 from .planned import dependences_of, draw_plan
 from .reading import Contents, matrix, read, split_of_subjects
 from .statistics import distribution, rank_correlations
-from .training import shares_of
-from .worst import worst_pictures
+from .strata import shares_of
 
 SCHEMA = "eyerender/inspection/1"
 IMAGES = 100_000

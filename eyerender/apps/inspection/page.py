@@ -417,7 +417,7 @@ def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -
         f"{len(beyond)} of {len(moved)} numbers differ by more than chance. The distance of Kolmogorov and Smirnov is "
         "the largest difference of the two cumulative distributions, from 0 to 1. Two samples of one distribution "
         'exceed the distance "by chance" in one case of twenty. Whole subjects are compared, because images of one '
-        "subject resemble each other; images are, where a dataset has less than two subjects.",
+        "subject resemble each other; images are, where a dataset has less than two subjects."
     ]
     if beyond:
         content += [

@@ -32,21 +32,13 @@ _MOSTLY, _LEAST_CONTRAST = 0.5, 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureSummary:
-    """What is kept of a picture.
+    """What is kept of a picture."""
 
-    Attributes:
-        numbers: figures by name.
-        thumbnail: (SIDE, SIDE) mean levels, 0 to 255.
-        digest: 8 bytes; the same for pictures of the same pixels.
-        mask: the mask, if there is one that fits the picture.
-        faults: what is wrong.
-    """
-
-    numbers: dict[str, float]
-    thumbnail: Bytes
-    digest: bytes
-    mask: Bytes | None
-    faults: list[Fault]
+    numbers: dict[str, float]  # figures by name
+    thumbnail: Bytes  # (SIDE, SIDE) mean levels, 0 to 255
+    digest: bytes  # 8 bytes; the same for pictures of the same pixels
+    mask: Bytes | None  # the mask, if there is one that fits the picture
+    faults: list[Fault]  # what is wrong
 
 
 def measure(entry: ImageEntry) -> PictureSummary:

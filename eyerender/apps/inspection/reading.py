@@ -19,9 +19,8 @@ from ...base.processes import ordered
 from ...base.progress import Progress, notify
 from ...folders.imagefolder import Entries, ImageEntry, ImageFolder, opened_entries
 from ...folders.packed import PackedLines
-from .faults import Fault
+from .faults import Fault, contradictions
 from .figures import groups_of, numbers_of
-from .labels import contradictions
 from .pictures import SIDE, mask_contradictions, measure
 
 _LARGEST = 1e30  # of a number in a column
@@ -46,31 +45,18 @@ class _Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """What was read of a dataset; arrays have one value per image that was read.
+    """What was read of a dataset; arrays have one value per image that was read."""
 
-    Attributes:
-        folder: the dataset.
-        rows: (n,) rows of the folder's entries.
-        names: (n,) files of the images, empty where the line cannot be read.
-        frames: (n,) numbers of the frames, -1 where there are none.
-        subjects: (n,) numbers of the subjects, -1 where there are none.
-        groups: (n,) name of a group -> value, by kind of group.
-        columns: name -> (n,), nan where an image has no such number.
-        thumbnails: (n, SIDE, SIDE) mean levels.
-        digests: (n,) digests of the pixels, empty where there is no picture.
-        faults: place among the rows -> what is wrong.
-    """
-
-    folder: ImageFolder
-    rows: Ints
-    names: list[str]
-    frames: Ints
-    subjects: Ints
-    groups: dict[str, Objects]
-    columns: dict[str, Singles]
-    thumbnails: Bytes
-    digests: list[bytes]
-    faults: dict[int, list[Fault]]
+    folder: ImageFolder  # the dataset
+    rows: Ints  # (n,) rows of the folder's entries
+    names: list[str]  # (n,) files of the images, empty where the line cannot be read
+    frames: Ints  # (n,) numbers of the frames, -1 where there are none
+    subjects: Ints  # (n,) numbers of the subjects, -1 where there are none
+    groups: dict[str, Objects]  # (n,) name of a group -> value, by kind of group
+    columns: dict[str, Singles]  # name -> (n,), nan where an image has no such number
+    thumbnails: Bytes  # (n, SIDE, SIDE) mean levels
+    digests: list[bytes]  # (n,) digests of the pixels, empty where there is no picture
+    faults: dict[int, list[Fault]]  # place among the rows -> what is wrong
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -18,21 +18,13 @@ _NAMES = ("min", "q01", "q25", "median", "q75", "q99", "max")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Distribution:
-    """Distribution of a column.
+    """Distribution of a column."""
 
-    Attributes:
-        column: its name.
-        count: images that have the number.
-        quantiles: minimum, 1, 25, 50, 75 and 99 % quantiles, and maximum.
-        edges: (BINS + 1,) of the bins; empty where all numbers are equal.
-        counts: (BINS,) in each bin; the first and the last one hold all beyond.
-    """
-
-    column: str
-    count: int
-    quantiles: tuple[float, ...]
-    edges: Floats
-    counts: Ints
+    column: str  # its name
+    count: int  # images that have the number
+    quantiles: tuple[float, ...]  # minimum, 1, 25, 50, 75 and 99 % quantiles, and maximum
+    edges: Floats  # (BINS + 1,) of the bins; empty where all numbers are equal
+    counts: Ints  # (BINS,) in each bin; the first and the last one hold all beyond
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what the JSON holds."""

@@ -1,4 +1,4 @@
-"""Strata of a dataset, and some images of each for a contact sheet."""
+"""Strata of a dataset, with some images of each for a contact sheet, and the shares that matter to training."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from ...base.arrays import Bools, Ints, Objects
 from ...dataset.selection import scrambled
-from .figures import DRAW
+from ...rig.plausibility import SATURATED_SHARE
+from .figures import DRAW, EYE_PRESENT, GAZE_ANGLE, LIDS_SHUT, PUPIL_VISIBLE, SATURATED
 from .reading import Contents, spread
 
 _KINDS = 8  # values of a group, or of a drawn whole number, that are strata
@@ -100,3 +101,25 @@ def _some(contents: Contents, places: Ints) -> tuple[int, ...]:
 
 def _places(places: Ints) -> tuple[int, ...]:
     return tuple(int(at) for at in places)
+
+
+# What is shared out: its column, and the names of the ranges that end below the given numbers.
+_RANGES = {
+    "gaze": (GAZE_ANGLE, {"to 10 deg": 10, "to 20 deg": 20, "to 35 deg": 35, "beyond": np.inf}),
+    "lids": (LIDS_SHUT, {"open": 0.25, "half shut": 0.75, "shut": np.inf}),
+    "pupil": (PUPIL_VISIBLE, {"hidden": 1e-9, "half hidden": 0.5, "visible": np.inf}),
+    "eye": (EYE_PRESENT, {"none": 0.5, "there": np.inf}),
+    "saturated pixels": (SATURATED, {"to 20 %": SATURATED_SHARE + 1e-9, "more": np.inf}),
+}
+
+
+def shares_of(contents: Contents) -> dict[str, dict[str, float]]:
+    """Return the shares of the images in ranges of each quantity, among the images that have it."""
+    out = {}
+    for name, (column, ends) in _RANGES.items():
+        values = contents.columns.get(column, np.zeros(0))
+        values = values[np.isfinite(values)]
+        if len(values):
+            counts = np.bincount(np.searchsorted(list(ends.values()), values, side="right"), minlength=len(ends))
+            out[name] = dict(zip(ends, (counts / len(values)).tolist(), strict=True))
+    return out

@@ -13,14 +13,15 @@ from ...eye.model import EyeModel
 from ...imaging.moments import eye_motion
 from ...optics.triangles import sharp_edges
 from ...region.limbus import lower
-from ...report.style import ANALYTIC, IMAGE, TARGET
+from ...report.style import ANALYTIC, CAMERA, IMAGE, TARGET
 from ...rig.camera import PinholeCamera
 from ...rig.light import Lamp
+from ...rig.rig import RigGeometry
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 
 LIGHT, SIGHT, SCREEN, GLOBE, LIMBUS = "#E69F00", "#CC79A7", "#7A7A7A", "#B9B9B9", "#8A6D4B"
-CAMERA, AXIS, OBSTACLE = "#5B3A8C", "#009E73", "#555555"
+AXIS, OBSTACLE = "#009E73", "#555555"
 PUPIL = "#1c1c1c"
 LEGEND = (
     ("camera and its window", CAMERA),
@@ -31,7 +32,7 @@ LEGEND = (
     ("optic axis", AXIS),
     ("screen and targets", SCREEN),
 )
-FEW_LIGHTS, MAX_LABELLED_LIGHTS, FAR_MM = 4, 24, 2000.0
+FEW_LIGHTS, MAX_LABELLED_LIGHTS = 4, 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,10 +246,15 @@ def _hit(eye: EyeModel, M: Floats, t: Floats, origin: Floats, direction: Floats)
     return np.asarray(origin + direction * distance if ok else np.full(3, np.nan))
 
 
-def extent_mm(drawn: Strokes, eye_mm: Floats) -> tuple[Floats, float]:
-    """Compute centre (3,) and radius of a ball around the drawing, without what is more than 2 m from an eye."""
+def extent_mm(drawn: Strokes, eye_mm: Floats, rig: RigGeometry) -> tuple[Floats, float]:
+    """Compute centre (3,) and radius of a ball around the drawing, without what is far from the eye.
+
+    Far is three times as far as the farthest camera or LED: a headset is not made small by its distant screen.
+    """
+    places = [*(camera.nodal_point_mm for camera in rig.cameras), *(lamp.position_mm for lamp in rig.lights)]
+    far = 3.0 * float(np.linalg.norm(np.array(places) - eye_mm, axis=1).max())
     points = drawn.ends_mm.reshape(-1, 3)
-    points = points[np.linalg.norm(points - eye_mm, axis=1) < FAR_MM]
+    points = points[np.linalg.norm(points - eye_mm, axis=1) < far]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     return np.asarray(middle), float(max(20.0, np.linalg.norm(points - middle, axis=1).max()))
 

@@ -19,7 +19,7 @@ from nicegui import Client, app, ui
 
 from ...analytic.observer import trace
 from ...base.errors import EyerenderError, InputError, one_line
-from ...gaze.regression import Regression
+from ...eye.catalogue import catalogue_names
 from ...report.overlay import feature_marks
 from ...report.style import ANALYTIC, IMAGE
 from ...scene import Frames, Scene
@@ -27,9 +27,9 @@ from ...scene.observation import Observations
 from ...scene.spec import SceneSpec
 from .drawing import LEGEND, Strokes, apex_mm, strokes
 from .painter import GOAL_SPP, MAX_REASON, Order, Painter, Shown, line_of
-from .readout import calibrated, feature_table, gaze_line
+from .readout import Estimator, calibrated, exposure_line, feature_table, gaze_line, poses_line
 from .rig_view import RigView
-from .setup import Setup, directions, named
+from .setup import Setup, directions, half_width_deg, lobe_exponent, named, ring_note
 from .source import python_source
 
 MAX_UNDO = 50
@@ -159,7 +159,8 @@ class Tab:
         self._light = self._lens = 0  # the light and the camera that the knobs move
         self._before: deque[Setup] = deque(maxlen=MAX_UNDO)
         self._changed = 0.0
-        self._estimator: Regression | None = None
+        self._estimator: Estimator | None = None
+        self._summing: asyncio.TimerHandle | None = None
         self._frames: Frames
         self._truth: Observations
         self._row = 0
@@ -226,6 +227,8 @@ class Tab:
             self._found = ui.checkbox("extracted from the picture", value=True, on_change=lambda: self._order())
             self._found.props("dense").style(f"--q-primary: {IMAGE}; color: {IMAGE}")
         self._gaze = ui.label("").classes("gaze")
+        self._poses = ui.label("").classes("gaze")
+        self._exposed = ui.label("").classes("gaze")
         self._table = ui.html("", sanitize=False).classes("features")
 
     def _build_rig(self) -> None:
@@ -247,6 +250,9 @@ class Tab:
             heads = {k: f"{k}" for k in range(len(spec.subject.head_positions_mm))}
             self._head = _choice("Head", heads, lambda v: self._apply(lambda s: s.with_head(v), refresh=True))
         self._choices = group
+        with _group("Head against the rig"):
+            names = ("Closer to the rig (eye relief)", "To the subject's left", "Up")
+            self._shift = [Knob(name, "mm", 0.1, lambda _: self._move_head(), digits=2) for name in names]
         with _group("Gaze"):
             name = "target" if spec.targets is not None else "pose"
             choices = {-1: "set by hand", **{k: f"{name} {k + 1}" for k in range(min(self._setup.fixations, 500))}}
@@ -254,6 +260,10 @@ class Tab:
             self._azimuth = Knob("Azimuth, to the subject's left", "°", 0.5, lambda _: self._turn(), digits=2)
             self._elevation = Knob("Elevation, up", "°", 0.5, lambda _: self._turn(), digits=2)
         with _group("Eye"):
+            models = {name: name for name in catalogue_names()}
+            own = spec.eye.model if isinstance(spec.eye.model, str) else ""
+            self._model = _choice("Eye model", models if own in models else {own: own, **models}, self._choose_model)
+            self._model.set_visibility(spec.person is None and spec.population is None and bool(own))
             self._pupil = Knob("Pupil", "mm", 0.1, lambda v: self._change("eye.pupil_diameter_mm", v), digits=2)
             self._lids = {
                 "blink": Knob("Lid opening", "%", 1, lambda v: self._apply(lambda s: s.with_opening(v / 100))),
@@ -265,15 +275,19 @@ class Tab:
             self._lamp = _choice("LED", _numbers(count), self._choose_light)
             self._lamp_place = [Knob(axis, "mm", 0.5, lambda _: self._move_light()) for axis in AXES]
             self._power = Knob("Intensity", "mW/sr", None, lambda _: self._move_light(), digits=3)
+            self._size = Knob("Radius", "mm", 0.05, lambda v: self._light_changed(radius_mm=v), digits=3)
+            self._lobe = Knob("Half-width of its lobe", "°", 0.5, lambda v: self._light_changed(lobe_deg=v), digits=2)
+            self._ring = ui.label("").classes("hint")
             with ui.element("div").classes("line"):
+                _button("Aim at the eye", lambda: self._light_changed(aim_mm=self._setup.apex_mm.tolist()))
                 _button("Add an LED", self._add_light)
                 _button("Remove it", lambda: self._apply(lambda s: s.without_light(self._light), refresh=True))
         with _group("Camera"):
             self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
             self._camera_place = [Knob(axis, "mm", 0.5, lambda _: self._move_camera()) for axis in AXES]
-            self._focal = Knob(
-                "Focal length", "mm or px", None, lambda v: self._apply(lambda s: s.with_focal_length(self._lens, v))
-            )
+            self._focal = Knob("Focal length", "mm or px", None, lambda v: self._lengthen(v))
+            self._field = Knob("Field of view, horizontal", "°", 0.5, self._widen, digits=2)
+            self._width = Knob("Width of all pictures", "px", 10, self._resize, digits=0)
             with ui.element("div").classes("line"):
                 self._aim = _button(
                     "Aim at the eye", lambda: self._apply(lambda s: s.with_camera_aimed(self._lens), refresh=True)
@@ -312,8 +326,21 @@ class Tab:
         self._complain(one_line("; ".join(warnings), MAX_REASON))
         self._rig.show(drawn)
         self._order()
+        self._sum_up()
         if refresh:
             self._refresh()
+
+    def _sum_up(self) -> None:
+        """Describe all poses, and the light on the eye once nothing has changed for a moment."""
+        if self._summing is not None:
+            self._summing.cancel()
+        self._summing = self._loop.call_later(SETTLED_S / 2, self._show_sums)
+
+    def _show_sums(self) -> None:
+        setup = self._setup
+        with suppress(EyerenderError, ValueError, ArithmeticError, np.linalg.LinAlgError):
+            self._poses.set_text(poses_line(setup))
+            self._exposed.set_text(exposure_line(setup))
 
     def _remember(self, setup: Setup) -> None:
         """Store the current setup for `_undo`, unless it lasted less than `SETTLED_S` or does not change."""
@@ -347,6 +374,31 @@ class Tab:
         with self._silence():
             self._fixation.set_value(-1)
 
+    def _move_head(self) -> None:
+        x, y, z = (knob.value for knob in self._shift)
+        self._apply(lambda setup: setup.with_shift((x, y, z)))
+
+    def _choose_model(self, name: str) -> None:
+        if name != self._setup.scene.spec.eye.model:
+            self._apply(lambda setup: setup.changed({"eye.model": name}), refresh=True)
+
+    def _lengthen(self, focal_length: float) -> None:
+        self._apply(lambda setup: setup.with_focal_length(self._lens, focal_length))
+        self._refresh_field()
+
+    def _widen(self, field_deg: float) -> None:
+        self._apply(lambda setup: setup.with_field(self._lens, field_deg))
+        self._refresh_focal()
+
+    def _resize(self, width_px: float) -> None:
+        self._apply(lambda setup: setup.with_width(round(width_px)))
+        self._refresh_focal()
+
+    def _light_changed(self, lobe_deg: float | None = None, **fields: Any) -> None:
+        if lobe_deg is not None:
+            fields["lobe_exponent"] = lobe_exponent(lobe_deg)
+        self._apply(lambda setup: setup.with_light(self._light, **fields))
+
     def _choose_light(self, light: int) -> None:
         self._light = light
         self._refresh()
@@ -379,7 +431,7 @@ class Tab:
         self._refresh_light()  # rings move with their camera
 
     def _look_at_rig(self) -> None:
-        self._rig.look_at_rig(self._drawn, apex_mm(self._frames, self._row))
+        self._rig.look_at_rig(self._drawn, apex_mm(self._frames, self._row), self._setup.scene.rig)
 
     def _look_from_camera(self) -> None:
         camera = self._setup.scene.rig.cameras[self._setup.camera]
@@ -428,20 +480,37 @@ class Tab:
         apex = apex_mm(self._frames, self._row)
         _set_place(self._camera_place, scene.rig.cameras[self._lens].nodal_point_mm, apex)
         self._aim.set_enabled(scene.spec.rig.cameras[self._lens].calibration is None)
-        _, focal = setup.focal_length(self._lens)
+        self._refresh_focal()
+        self._refresh_field()
+        size = scene.spec.image.window_px or scene.spec.rig.cameras[0].resolution_px
+        self._width.set(size[0], 40, 2 * size[0])
+        for knob, value in ((self._exposure, scene.spec.sensor.time_ms), (self._aperture, scene.spec.sensor.f_number)):
+            knob.set(value, value / 3, 3 * value)
+        for knob, shift in zip(self._shift, setup.shift_mm, strict=True):
+            knob.set(shift, -10, 10)
+        if isinstance(scene.spec.eye.model, str):
+            with self._silence():
+                self._model.set_value(scene.spec.eye.model)
+
+    def _refresh_focal(self) -> None:
+        _, focal = self._setup.focal_length(self._lens)
         self._focal.enable(focal is not None)
-        for knob, value in (
-            (self._focal, focal),
-            (self._exposure, scene.spec.sensor.time_ms),
-            (self._aperture, scene.spec.sensor.f_number),
-        ):
-            if value is not None:
-                knob.set(value, value / 3, 3 * value)
+        if focal is not None:
+            self._focal.set(focal, focal / 3, 3 * focal)
+
+    def _refresh_field(self) -> None:
+        field_deg = self._setup.field_deg(self._lens)
+        self._field.enable(field_deg is not None)
+        if field_deg is not None:
+            self._field.set(field_deg, 1, 120)
 
     def _refresh_light(self) -> None:
         lamp = self._setup.scene.rig.lights[self._light]
         _set_place(self._lamp_place, lamp.position_mm, apex_mm(self._frames, self._row))
         self._power.set(lamp.intensity_mw_sr, 0, _round_up(3 * lamp.intensity_mw_sr))
+        self._size.set(lamp.radius_mm, 0, max(3.0, 2 * lamp.radius_mm))
+        self._lobe.set(half_width_deg(lamp.lobe_exponent), 2, 90)
+        self._ring.set_text(ring_note(self._setup.scene.spec.rig, self._light))
 
     @contextmanager
     def _silence(self) -> Iterator[None]:
@@ -494,7 +563,7 @@ class Tab:
         waits = self._found.value and shown.found is None  # features arrive shortly after the image
         if current and not waits:
             found = shown.found if self._found.value else None
-            self._table.set_content(feature_table(truth, found, shown.hidden))
+            self._table.set_content(feature_table(truth, found, shown.hidden, shown.coarse))
             self._gaze.set_text(gaze_line(self._setup, self._estimator, truth, found))
 
     def _complain(self, text: str) -> None:

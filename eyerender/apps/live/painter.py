@@ -58,50 +58,29 @@ MAX_REASON = 300
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A tab's request for an image.
+    """A tab's request for an image."""
 
-    Attributes:
-        number: number of the order, counted per tab.
-        frame: one row: the eye in its pose, and the scene.
-        extract: whether to extract the features from the image.
-    """
-
-    number: int
-    frame: Frames
-    extract: bool = True
+    number: int  # number of the order, counted per tab
+    frame: Frames  # one row: the eye in its pose, and the scene
+    extract: bool = True  # whether to extract the features from the image
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Shown:
-    """Answer to an order: an image, or the problem that prevents it.
+    """Answer to an order: an image, or the problem that prevents it."""
 
-    Attributes:
-        number: number of the order.
-        samples: samples per pixel so far.
-        coarse: side of the preview's pixels, in sensor pixels; 1 for a full-resolution image.
-        size_px: width and height of the picture.
-        window: the window of the sensor.
-        data: the image as a file, brightened for viewing.
-        kind: media type of that file.
-        found: the extracted features; None if they were not requested.
-        hidden: for each light, what hides its glint ("" for a visible one).
-        saturated: whether the picture is saturated.
-        seconds: time of the last rendering.
-        problem: one line that describes why there is no image; None if there is one.
-    """
-
-    number: int
-    samples: int = 0
-    coarse: int = 1
-    size_px: tuple[int, int] = (0, 0)
-    window: Window = (0, 0, 0, 0)
-    data: bytes = b""
-    kind: str = ""
-    found: Observations | None = None
-    hidden: tuple[str, ...] = ()
-    saturated: bool = False
-    seconds: float = 0.0
-    problem: str = ""
+    number: int  # number of the order
+    samples: int = 0  # samples per pixel so far
+    coarse: int = 1  # side of the preview's pixels, in sensor pixels; 1 for a full-resolution image
+    size_px: tuple[int, int] = (0, 0)  # width and height of the picture
+    window: Window = (0, 0, 0, 0)  # the window of the sensor
+    data: bytes = b""  # the image as a file, brightened for viewing
+    kind: str = ""  # media type of that file
+    found: Observations | None = None  # the extracted features; None if they were not requested
+    hidden: tuple[str, ...] = ()  # for each light, what hides its glint ("" for a visible one)
+    saturated: bool = False  # whether the picture is saturated
+    seconds: float = 0.0  # time of the last rendering
+    problem: str = ""  # one line that describes why there is no image; None if there is one
 
 
 Deliver = Callable[[Shown], None]
@@ -174,11 +153,7 @@ class Painter:
     _sample_s: float = 1e-6  # time of the last band per sample
 
     def start(self) -> None:
-        """Start the renderer in its thread.
-
-        Raises:
-            BackendError: no backend renders.
-        """
+        """Start the renderer in its thread; BackendError if no backend renders."""
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(ready,), name="painter", daemon=True)
         self._thread.start()

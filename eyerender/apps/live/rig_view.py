@@ -10,6 +10,7 @@ from nicegui import ui
 from nicegui.elements.scene.scene_object3d import Object3D
 
 from ...base.arrays import Floats
+from ...rig.rig import RigGeometry
 from .drawing import Label, Strokes, colours_of, extent_mm
 
 _CM = 0.1
@@ -58,9 +59,9 @@ class RigView:
             text.move(*(_CM * v for v in label.place_mm))
         self._shown = drawn.labels
 
-    def look_at_rig(self, drawn: Strokes, eye_mm: Floats) -> None:
+    def look_at_rig(self, drawn: Strokes, eye_mm: Floats, rig: RigGeometry) -> None:
         """Turn the view to the whole rig."""
-        middle, radius = extent_mm(drawn, eye_mm)
+        middle, radius = extent_mm(drawn, eye_mm, rig)
         self._look(middle, 1.25 * radius / np.sin(np.radians(_FIELD_DEG / 2)), np.array([0.45, -0.75, 0.5]))
 
     def look_at_eye(self, apex_mm: Floats) -> None:

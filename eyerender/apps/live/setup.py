@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 
 from ...base.arrays import Floats
 from ...base.errors import InputError
+from ...dataset.picturesize import scaled
 from ...rig.camera import Camera
+from ...rig.distortion import FisheyeDistortion
 from ...rig.rig import Rig
 from ...scene import Frames, Scene
 from ...scene.observation import EYES
@@ -24,26 +26,19 @@ class Setup:
     """A scene with one fixation and one head position, selected from a scene that may have many.
 
     Methods that change something return a new setup, and raise `InputError` for a value that does not fit.
-
-    Attributes:
-        origin: the spec as it was loaded, with all of its fixations and head positions.
-        scene: the current scene, with one fixation and one head position.
-        eye: the selected eye, "right" or "left".
-        camera: number of the selected camera.
-        fixation: number of the current fixation of `origin`; None for a gaze set by the user.
-        head: number of the head position of `origin`.
     """
 
-    origin: SceneSpec
-    scene: Scene
-    eye: str
-    camera: int = 0
-    fixation: int | None = 0
-    head: int = 0
+    origin: SceneSpec  # the spec as it was loaded, with all of its fixations and head positions
+    scene: Scene  # the current scene, with one fixation and one head position
+    eye: str  # the selected eye, "right" or "left"
+    camera: int = 0  # number of the selected camera
+    fixation: int | None = 0  # number of the current fixation of `origin`; None for a gaze set by the user
+    head: int = 0  # number of the head position of `origin`
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # how far all head positions were moved by hand
 
     @classmethod
     def of(cls, scene: Scene) -> Self:
-        """Start with the first frame of a scene."""
+        """Start with the fixation of a scene that is nearest to the middle of all, at its first head position."""
         scene.refuse_spectacles("the live page shows scenes")
         spec = scene.spec
         # Eyes respond to the mean of all targets, so they must not respond to the current one only.
@@ -51,7 +46,7 @@ class Setup:
             demand = min(demand_d(spec, scene.targets_mm), MOST_ACCOMMODATION_D)
             scene = scene.with_({"subject.accommodation_d": demand})
         start = cls(origin=spec, scene=scene, eye=EYES[scene.index().eye[0]])
-        return start.showing(eye=start.eye).following(0).with_head(0)
+        return start.showing(eye=start.eye).following(_middle(scene)).with_head(0)
 
     @property
     def fixations(self) -> int:
@@ -111,8 +106,12 @@ class Setup:
 
     def with_head(self, head: int) -> Self:
         """Move the head to one of the positions of the loaded scene."""
-        places = self.origin.subject.head_positions_mm
-        return replace(self.changed({"subject.head_positions_mm": [places[head]]}), head=head)
+        place = np.round(np.add(self.origin.subject.head_positions_mm[head], self.shift_mm), 6)
+        return replace(self.changed({"subject.head_positions_mm": [place.tolist()]}), head=head)
+
+    def with_shift(self, shift_mm: tuple[float, float, float]) -> Self:
+        """Move the head against the rig: towards it (eye relief), to the subject's left and up (slippage)."""
+        return replace(self, shift_mm=shift_mm).with_head(self.head)
 
     def with_opening(self, share: float) -> Self:
         """Open the lids to a share of their opening: 1 open, 0 shut."""
@@ -158,6 +157,33 @@ class Setup:
         key = "focal_length_px" if spec.focal_length_mm is None else "focal_length_mm"
         return key, getattr(spec, key)
 
+    def field_deg(self, camera: int) -> float | None:
+        """Return the horizontal field of view of a camera; None if it has a calibration or is a fisheye."""
+        built = self.scene.rig.cameras[camera]
+        fisheye = isinstance(self.scene.spec.rig.cameras[camera].distortion, FisheyeDistortion)
+        if self.focal_length(camera)[1] is None or fisheye:
+            return None
+        return float(np.degrees(2 * np.arctan(built.resolution_px[0] / (2 * built.K[0, 0]))))
+
+    def with_field(self, camera: int, field_deg: float) -> Self:
+        """Change the focal length of a camera so that its picture is so wide.
+
+        Raises:
+            InputError: the angle is not between 1 and 150 degrees, or the camera has no single focal length.
+        """
+        old = self.field_deg(camera)
+        if old is None or not 1.0 <= field_deg <= 150.0:
+            raise InputError("must be 1 to 150 degrees, of a camera with a focal length", path=f"rig.cameras.{camera}")
+        longer = np.tan(np.radians(old / 2)) / np.tan(np.radians(field_deg / 2))
+        return self.with_focal_length(camera, round(float(longer * (self.focal_length(camera)[1] or 0.0)), 6))
+
+    def with_width(self, width_px: int) -> Self:
+        """Change the number of pixels of the pictures, which show the same (`generate --size`)."""
+        spec = self.scene.spec
+        width, height = spec.image.window_px or spec.rig.cameras[0].resolution_px
+        data = scaled(spec.to_mapping(), (width_px, max(1, round(height * width_px / width))))
+        return replace(self, scene=self.scene.replaced(SceneSpec.from_mapping(data)))
+
     def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
         """Move a camera. A camera with a target point keeps looking at it; others keep their direction."""
         spec = self.scene.spec.rig.cameras[camera]
@@ -185,7 +211,8 @@ class Setup:
         """
         shown = self.scene.located()
         data = shown.to_mapping()
-        data["subject"] = {**data["subject"], "head_positions_mm": self.origin.subject.head_positions_mm}
+        places = np.round(np.add(self.origin.subject.head_positions_mm, self.shift_mm), 6)
+        data["subject"] = {**data["subject"], "head_positions_mm": places.tolist()}
         if self.fixation is not None:
             data["subject"]["accommodation_d"] = self.origin.subject.accommodation_d
             data.pop("targets", None)
@@ -197,20 +224,60 @@ class Setup:
             data["eye"]["model"] = str((self.scene.base / model).resolve())
         return SceneSpec.from_mapping(data)
 
-    def with_all_targets(self) -> Scene | None:
-        """Restore all targets of the loaded scene, on the current screen; None if it gives poses."""
-        if self.origin.targets is None:
-            return None
-        spec = self.scene.spec.model_copy(update={"targets": self.origin.targets, "poses": None})
-        return self.scene.replaced(spec, rig=self.scene.rig)
+    def with_all_fixations(self) -> Scene:
+        """Restore all targets of the loaded scene, on the current screen, or all its poses."""
+        kept = {"targets": self.origin.targets, "poses": self.origin.poses}
+        return self.scene.replaced(self.scene.spec.model_copy(update=kept), rig=self.scene.rig)
+
+    @property
+    def rows(self) -> Frames:
+        """Return the frames of all fixations that the selected camera has of the selected eye."""
+        frames = self.with_all_fixations().frames()
+        shown = (frames.index.camera == self.camera) & (frames.index.eye == EYES.index(self.eye))
+        return frames.take(np.flatnonzero(shown))
 
     def _with_rig(self, rig: Rig) -> Self:
         return replace(self, scene=self.scene.with_(rig=rig))
 
     def _targets(self) -> Any:
         """Return the targets of the loaded scene on the current screen, (f, 3); None if it gives poses."""
-        scene = self.with_all_targets()
-        return None if scene is None else scene.targets_mm
+        return None if self.origin.targets is None else self.with_all_fixations().targets_mm
+
+
+def _middle(scene: Scene) -> int:
+    """Return the fixation whose direction is nearest to the mean of all."""
+    frames = scene.frames()
+    fixations = np.unique(frames.index.fixation)
+    pose = np.stack([frames.pose.azimuth_rad, frames.pose.elevation_rad], axis=1)
+    mean = np.array([pose[frames.index.fixation == k].mean(axis=0) for k in fixations])
+    return int(fixations[np.linalg.norm(mean - mean.mean(axis=0), axis=1).argmin()])
+
+
+def half_width_deg(exponent: float) -> float:
+    """Return the angle at which a lobe cos^m has half of its intensity; 90 degrees for an isotropic one."""
+    return float(np.degrees(np.arccos(0.5 ** (1.0 / exponent)))) if exponent > 0.0 else 90.0
+
+
+def lobe_exponent(half_width: float) -> float:
+    """Return the exponent m of a lobe cos^m with this half-width in degrees."""
+    if not 1.0 <= half_width <= 90.0:
+        raise InputError("must be 1 to 90 degrees", path="half-width of the lobe")
+    return 0.0 if half_width >= 89.9 else round(float(np.log(0.5) / np.log(np.cos(np.radians(half_width)))), 6)
+
+
+def ring_note(rig: Rig, light: int) -> str:
+    """Say whether a light, counted over all LEDs of rings, belongs to a ring, and which camera it moves with."""
+    first = 0
+    for led in rig.lights:
+        count = 1 if led.ring is None else led.ring.count
+        if light < first + count:
+            if led.ring is None:
+                return ""
+            return (
+                f"One of a ring of {count} that moves with camera {led.ring.camera}; a change makes them single LEDs."
+            )
+        first += count
+    return ""
 
 
 def named(cameras: tuple[Camera, ...]) -> list[str]:

@@ -14,8 +14,7 @@ from ...base.progress import Progress, followed
 from ...folders.exported import EXPORT, exported_gamma
 from .figures import FIGURES, RADIUS_PX, Scaled, measure, ratio
 from .folder import FolderFigures, PictureFolder, Skipped, open_source, pictures
-from .patches import patches
-from .separability import MISSING, available, separability, to_mapping
+from .separability import MISSING, available, left_out, patches, separability, to_mapping
 
 SCHEMA = "eyerender/realism/2"
 DEFAULT_LIMIT = 200
@@ -97,10 +96,10 @@ def realism(
     limit: int = DEFAULT_LIMIT,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure one folder of pictures, or two to compare.
+    """Measure one folder of pictures, two to compare, or one and three or more cameras.
 
     Args:
-        folders: one or two folders, as for `measure_folder`.
+        folders: the folders, as for `measure_folder`.
         output: an HTML page to write, with the table and montages at equal scale.
         gammas: none, one for all folders, or one for each.
         limit: the largest number of images of a folder.
@@ -108,17 +107,21 @@ def realism(
 
     Returns:
         A mapping (schema eyerender/realism/2): the definitions, the statistics of each folder, and for two folders the
-            ratio of their medians, first over second, and the separability of their patches.
+            ratio of their medians, first over second, and the separability of their patches; with cameras, how well
+            the first folder is told from one that was left out (`left_out`).
 
     Raises:
         InputError: a folder or an argument cannot be used.
     """
+    if len(folders) == 3:
+        raise InputError("two cameras are too few: one is left out, and one more takes the folder's place")
     if len(gammas) not in (0, 1, len(folders)):
         raise InputError("give one for all folders, or one for each", source="--gamma")
     each = [gammas[k if len(gammas) > 1 else 0] if gammas else None for k in range(len(folders))]
     found = [measure_folder(f, gamma=g, limit=limit, progress=progress) for f, g in zip(folders, each, strict=True)]
     ratios = {name: ratio(*(f.median(name) for f in found)) for name in FIGURES} if len(found) == 2 else None
     test = separability(found[0], found[1]) if len(found) == 2 and available() else None
+    unseen = left_out(found[0], found[1:]) if len(found) > 3 and available() else None
     if output is not None:
         from .page import write
 
@@ -130,4 +133,5 @@ def realism(
         "ratios": ratios,
         "separability": None if test is None else to_mapping(test),
         "separability_reason": None if test is not None else MISSING if len(found) == 2 else "needs two folders",
+        "left_out": None if unseen is None else to_mapping(unseen),
     }

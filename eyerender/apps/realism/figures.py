@@ -47,50 +47,29 @@ FIGURES: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EyePicture:
-    """A picture of one eye with its landmarks; positions in px of the picture, pixel centres at integers.
+    """A picture of one eye with its landmarks; positions in px of the picture, pixel centres at integers."""
 
-    Attributes:
-        name: name of the image.
-        codes: (h, w) stored codes, full scale 255.
-        gamma: the codes store intensity^(1 / gamma).
-        pupil: outline of the pupil.
-        iris_x_px: middle of the iris' horizontal extent.
-        radius_px: R, half of that extent.
-        parts: (h, w) part of the eye at each pixel (docs/formats.md), None where it is unknown.
-    """
-
-    name: str
-    codes: Singles
-    gamma: float
-    pupil: Ellipse
-    iris_x_px: float
-    radius_px: float
-    parts: Bytes | None = None
+    name: str  # name of the image
+    codes: Singles  # (h, w) stored codes, full scale 255
+    gamma: float  # the codes store intensity^(1 / gamma)
+    pupil: Ellipse  # outline of the pupil
+    iris_x_px: float  # middle of the iris' horizontal extent
+    radius_px: float  # R, half of that extent
+    parts: Bytes | None = None  # (h, w) part of the eye at each pixel (docs/formats.md), None where it is unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scaled:
-    """A picture with linear levels in which R is 50 px, with the distances of its pixels from the eye.
+    """A picture with linear levels in which R is 50 px, with the distances of its pixels from the eye."""
 
-    Attributes:
-        level: (h, w) linear level, full scale 255.
-        clip: level from which a pixel counts as clipped.
-        parts: (h, w) part of the eye, None where it is unknown.
-        pupil: outline of the pupil.
-        centre: (x, y) of the iris: the middle of its horizontal extent, the height of the pupil.
-        rings: (h, w) distance from the iris' centre, R.
-        beside: (h, w) angle to the horizontal through the iris' centre, degrees, 0 to 90.
-        in_pupil: (h, w) distance from the pupil's centre in radii of its ellipse.
-    """
-
-    level: Singles
-    clip: float
-    parts: Bytes | None
-    pupil: Ellipse
-    centre: tuple[float, float]
-    rings: Floats = field(repr=False)
-    beside: Floats = field(repr=False)
-    in_pupil: Floats = field(repr=False)
+    level: Singles  # (h, w) linear level, full scale 255
+    clip: float  # level from which a pixel counts as clipped
+    parts: Bytes | None  # (h, w) part of the eye, None where it is unknown
+    pupil: Ellipse  # outline of the pupil
+    centre: tuple[float, float]  # (x, y) of the iris: the middle of its horizontal extent, the height of the pupil
+    rings: Floats = field(repr=False)  # (h, w) distance from the iris' centre, R
+    beside: Floats = field(repr=False)  # (h, w) angle to the horizontal through the iris' centre, degrees, 0 to 90
+    in_pupil: Floats = field(repr=False)  # (h, w) distance from the pupil's centre in radii of its ellipse
 
     @classmethod
     def of(cls, picture: EyePicture) -> Scaled:

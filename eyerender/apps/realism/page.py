@@ -25,8 +25,8 @@ def write(
     ratios: Mapping[str, float | None] | None,
     test: Mapping[str, Separability | None] | None = None,
 ) -> None:
-    """Write the page of one or two folders."""
-    title = "How real the pictures look" if len(found) == 1 else "Two folders of pictures compared"
+    """Write the page of folders."""
+    title = "How real the pictures look" if len(found) == 1 else f"{len(found)} folders of pictures compared"
     sections = [Section("Figures", _spread(found) if len(found) == 2 else None, _table(found, ratios))]
     if test is not None:
         sections.append(_separability(found, test))

@@ -225,7 +225,7 @@ def summary(
         safety: dict[str, Any] = eye_exposure(whole, place, wavelength_nm=scene.spec.wavelength_nm).to_mapping()
     except InputError as error:
         safety = {"note": NOTE, "reason": str(error)}
-    lights = len(scene.rig.lights) * len(scene.rig.cameras)
+    lights, extracted = len(scene.rig.lights) * len(scene.rig.cameras), extracted_noise(scene)
     seen = covered(found, min(2, len(scene.rig.lights)))
     return {
         "schema": SCHEMA,
@@ -239,8 +239,8 @@ def summary(
         "noise": {
             "outline_px": [finite_or_none(v) for v in noise.outline_px],
             "glint_px": [[finite_or_none(v) for v in row] for row in noise.glint_px],
-            "extracted_outline_px": [finite_or_none(v) for v in extracted_noise(noise).outline_px],
-            "extracted_glint_px": [[finite_or_none(v) for v in row] for row in extracted_noise(noise).glint_px],
+            "extracted_outline_px": [finite_or_none(v) for v in extracted.outline_px],
+            "extracted_glint_px": [[finite_or_none(v) for v in row] for row in extracted.glint_px],
         },
         "bound_deg": {"note": NOISE_ONLY, **gaze_of(found.bound_deg, seen)},
         "bound_with_fixation_deg": {

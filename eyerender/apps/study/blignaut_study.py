@@ -17,9 +17,10 @@ from .featureclouds import Cloud
 from .figures import clouds_figure, lines_figure
 from .findings import SETS
 from .guestrin_study import departures_of
+from .over_people import Experiment
 from .page_parts import ABOUT_READINGS, Apart, cards_of, rows_section
 from .results import Erratum, Finding, ModelResults, Row, keys_of
-from .study import Study, StudyJob
+from .study import Study, StudyJob, of_person
 from .waterfall import waterfall
 
 
@@ -33,7 +34,7 @@ class BlignautStudy(Study):
         ABOUT_READINGS,
     )
     protocols = ("published", "corrected")
-    population = None
+    of_models = True
     # The best regressions with few and with many targets are drawn.
     shown = ("R2 on C5", "R4 on C9", "R8 on C14", "R8 on C135")
     method = "the regression"
@@ -42,7 +43,8 @@ class BlignautStudy(Study):
 
     def scenes(self, job: StudyJob, protocol: str) -> Mapping[str, Scene]:
         """Build the one scene of a reading."""
-        return {"": blignaut.scene(job.who, blignaut.scene_key(departures_of(protocol, blignaut)))}
+        scene = blignaut.scene("E2" if job.person else job.who, blignaut.scene_key(departures_of(protocol, blignaut)))
+        return {"": of_person(scene, job.person) if job.person else scene}
 
     def estimates(
         self, scenes: Mapping[str, Scene], seen: Mapping[str, Observations], protocol: str
@@ -58,6 +60,9 @@ class BlignautStudy(Study):
     def part(self, job: StudyJob) -> ModelResults:
         """Replicate; centre the vectors in the corrected reading; by ray optics, correct each departure."""
         out: ModelResults = super().part(job)
+        if job.person:
+            out.rows = []  # of 72 functions and sets; the table over people has the best
+            return out
         observer = job.observing.kind
         clouds = out.more["clouds"] = {key: Cloud.of(seen) for key, (_, seen) in out.seen.items()}
         if ("corrected", observer) in out.seen:
@@ -77,6 +82,19 @@ class BlignautStudy(Study):
                     lambda seen, rig, some: _best_means(blignaut.run(seen, rig, some)),
                 )  # fmt: skip
         return out
+
+    def measured(self) -> Mapping[str, Experiment]:
+        """Return the best function of the experiment for each set, as condition of the table over people."""
+        return {c: Experiment(mean_deg=lit.blignaut_best(c)[1]) for c in SETS}
+
+    def tables(self, parts: Sequence[ModelResults]) -> dict[str, Any]:
+        """Keep the function of each set whose mean over people is the smallest."""
+        best: dict[tuple[str, ...], Mapping[str, Any]] = {}
+        for row in super().tables(parts).get("people", ()):
+            key = (row["protocol"], row["observer"], row["condition"].rpartition(" ")[2])
+            if row["mean_deg"] is not None and (key not in best or row["mean_deg"] < best[key]["mean_deg"]):
+                best[key] = row
+        return {"people": list(best.values())}
 
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
         """Test the paper's sentences on errors and feature clouds."""
@@ -137,7 +155,9 @@ class BlignautStudy(Study):
         ]  # fmt: skip
 
     def text(self, summary: Mapping[str, Any]) -> list[str]:
-        """Format the best function for each set."""
+        """Format the best function for each set, or what was found over people."""
+        if "people" in summary:
+            return super().text(summary)
         best: dict[tuple[str, ...], dict[str, Any]] = {}
         for row in summary["rows"]:
             key = (row["protocol"], row["observer"], row["eye_model"], row["calibration"])

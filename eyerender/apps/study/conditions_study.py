@@ -12,6 +12,7 @@ from ...report.page import Card, Content, Figure, Section, table_of
 from . import conditions as c
 from .conditions import ConditionsPart
 from .figures import lines_figure, map_figure, rows_figure
+from .over_people import Groups
 from .page_parts import Apart, rows_section
 from .results import Finding
 from .study import Study, StudyJob
@@ -41,6 +42,12 @@ class ConditionsStudy(Study):
     def part(self, job: StudyJob) -> ConditionsPart:
         """Compute all conditions of one eye model, or the pupil sizes of one person."""
         return c.conditions_part(job.who) if job.person is None else c.person_part(job.person)
+
+    def groups(self, part: ConditionsPart) -> Groups:
+        """Return the errors over the pupil's diameter."""
+        by = {f"{name}, {mm:g} mm": np.array([one]) for name, some in part.diameters.items()
+              for mm, one in zip(c.DIAMETERS_MM, some, strict=True)}  # fmt: skip
+        return {("corrected", "analytic"): by}
 
     def findings(self, parts: Sequence[ConditionsPart]) -> list[Finding]:
         """Return the effects of the conditions as findings without a published claim."""

@@ -20,11 +20,12 @@ from ...scene import Scene, load_scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
 from .authors_estimators import AuthorsGuestrinEizenman
-from .literature import departures
+from .literature import departures, guestrin_deg
+from .over_people import Experiment
 from .results import Row, known_mean, mean_row
 
 SCENE = "guestrin2006"
-HEADS = ("H1", "H2")
+HEADS, RISE = ("H1", "H2"), "H2 - H1"
 STARTS, SEED = 20, 2006
 
 DEPARTURES = departures(SCENE)
@@ -191,6 +192,12 @@ def restarts(
             "parameter_sd_of_the_lowest": dict(zip(NAMES, spread, strict=True)),
         },
     }
+
+
+def experiment() -> dict[str, Experiment]:
+    """Return what the four participants of [28] had: H1, H2 and the rise, paired by person."""
+    found = {head: guestrin_deg(head) for head in HEADS}
+    return {name: Experiment.of(values) for name, values in {**found, RISE: found["H2"] - found["H1"]}.items()}
 
 
 def optimiser_settings(protocols: Sequence[str]) -> dict[str, Any]:

@@ -19,9 +19,10 @@ from ...scene.observation import Observations
 from . import findings, guestrin
 from . import literature as lit
 from .figures import heads_figure
+from .over_people import Experiment, Groups
 from .page_parts import ABOUT_READINGS, Apart, cards_of, rows_section
 from .results import Erratum, Finding, ModelResults, Row, keys_of
-from .study import Study, StudyJob, StudyPlan
+from .study import Study, StudyJob, StudyPlan, of_person
 from .waterfall import waterfall
 
 FIXED, FREE = "model-based, index fixed", "model-based, index free"
@@ -42,7 +43,7 @@ class GuestrinStudy(Study):
         ABOUT_READINGS,
     )
     protocols = ("published", "corrected")
-    population = None
+    of_models = True
     facing = True
     shown = (FIXED, FREE)
     method = "the model-based estimator"
@@ -62,7 +63,8 @@ class GuestrinStudy(Study):
 
     def scenes(self, job: StudyJob, protocol: str) -> Mapping[str, Scene]:
         """Build the one scene of a reading."""
-        return {"": guestrin.scene(job.who, guestrin.scene_key(departures_of(protocol)))}
+        scene = guestrin.scene("E2" if job.person else job.who, guestrin.scene_key(departures_of(protocol)))
+        return {"": of_person(scene, job.person) if job.person else scene}
 
     def estimates(
         self, scenes: Mapping[str, Scene], seen: Mapping[str, Observations], protocol: str
@@ -79,7 +81,7 @@ class GuestrinStudy(Study):
     def part(self, job: StudyJob) -> ModelResults:
         """Replicate; by ray optics also restart the calibrations, correct each departure, and try the misprints."""
         out: ModelResults = super().part(job)
-        if job.observing.kind != "analytic":
+        if job.observing.kind != "analytic" or job.person:
             return out
         out.more["calibrations"] = [
             # The left eye is the right eye's mirror image, and so are its calibrations.
@@ -96,6 +98,21 @@ class GuestrinStudy(Study):
         if "corrected" in job.protocols:
             out.more["misprints"] = {name: _misprint(job.who, keys) for name, keys in MISPRINTS.items()}
         return out
+
+    def groups(self, part: ModelResults) -> Groups:
+        """Return the errors at H1 and H2, and the rise."""
+        out: dict[tuple[str, str], dict[str, Floats]] = {}
+        for key, done in part.done.items():
+            for name, one in done.items():
+                means = [np.nan if mean is None else mean for mean in one.means.values()]
+                found = {head: one.error_deg[one.rows(head)] for head in guestrin.HEADS}
+                found[guestrin.RISE] = np.array([means[1] - means[0]])
+                out.setdefault(key, {}).update({f"{VARIANTS[name]}, {head}": v for head, v in found.items()})
+        return out
+
+    def measured(self) -> Mapping[str, Experiment]:
+        """Return the four participants."""
+        return guestrin.experiment()
 
     def findings(self, parts: Sequence[ModelResults]) -> list[Finding]:
         """Test the paper's sentences on the means of each reading and observer."""

@@ -24,6 +24,7 @@ from ...gaze.directions import DirectionRegression
 from ...optics.transforms import direction_of
 from ...report.page import Card, number
 from ...rig.rig import RigGeometry
+from ...rig.sensor import Sensor
 from ...scene import Scene, load_scene
 from ...scene.observation import Observations
 from ...scene.spec import SceneSpec
@@ -39,10 +40,11 @@ FEATURES: dict[str, Feature] = {"pupil-glint vector": "pupil-glint", "pupil cent
 
 
 def scene(eye: str) -> Scene:
-    """Build the shipped scene with more directions: 5 x 5 over the range of its 3 x 3."""
+    """Build the shipped scene as a bare globe, with more directions: 5 x 5 over the range of its 3 x 3."""
     loaded = load_scene(SCENE, eye=eye)
     data = loaded.spec.to_mapping()
-    data["targets"] = None
+    data |= {"targets": None, "region": None}
+    data["sensor"]["psf_sigma_px"] = Sensor().psf_sigma_px
     data["poses"] = [{"azimuth_deg": a, "elevation_deg": e} for e in ELEVATIONS_DEG for a in AZIMUTHS_DEG]
     return Scene.of(SceneSpec.from_mapping(data, source=SCENE))
 

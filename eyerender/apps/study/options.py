@@ -19,6 +19,7 @@ class StudyOptions:
         population: Preset from which people are drawn (default: adults).
         people: Number of people, in place of eye models unless --eyes names some (default: none; rigs, appearance:
             100; conditions: 4, beside the models).
+        image_people: Number of these people whose images are rendered (default: all).
         protocol: guestrin2006 and blignaut2014: as the authors' software computes (published), as the paper describes
             (corrected), or both.
         observer: Features from ray optics (analytic), from rendered images (image), or both for comparison (default:
@@ -38,6 +39,7 @@ class StudyOptions:
 
     population: str | None = None
     people: int | None = None
+    image_people: int | None = None
     protocol: Literal["corrected", "published", "both"] = "both"
     observer: Literal["analytic", "image", "both"] | None = None
     seeds: int = 5
@@ -53,7 +55,7 @@ class StudyOptions:
     def __post_init__(self) -> None:
         if self.people is not None and not 1 <= self.people <= MOST_PEOPLE:
             raise InputError(f"must be 1 to {MOST_PEOPLE}, not {self.people}", path="people")
-        for name in ("seeds", "workers", "spp", "threads"):
+        for name in ("image_people", "seeds", "workers", "spp", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"must be >= 1, not {value}", path=name)

@@ -34,6 +34,11 @@ STUDIES: Final = MappingProxyType(
         "observers": "head_mounted:ObserversStudy",
         "conditions": "conditions_study:ConditionsStudy",
         "rigs": "rigs:RigsStudy",
+        "glasses": "glasses_study:GlassesStudy",
+        "pupil-size": "pupil_size:PupilSizeStudy",
+        "calibration": "calibration_study:CalibrationStudy",
+        "stereo": "stereo:StereoStudy",
+        "head-movement": "head_movement:HeadMovementStudy",
         "appearance": "appearance:AppearanceStudy",
     }
 )
@@ -62,8 +67,8 @@ def run_study(
     >>> er.apps.run_study("conditions", "out/conditions", eyes=["E2"])  # doctest: +SKIP
 
     Args:
-        study: guestrin2006, blignaut2014, observers, conditions, rigs or appearance; or your own: a subclass of
-            `Study`, or its name as `module:Class`.
+        study: the name of one of the package, as in `eyerender study --help`; or your own: a subclass of `Study`, or
+            its name as `module:Class`.
         folder: the folder for the results.
         options: protocol, observer, workers and the like.
         eyes: eye models (catalogue names or files; default: those of the study, or none if people are asked for).
@@ -148,8 +153,8 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
     if observer not in study.observers:
         known = " or ".join(map(repr, study.observers))
         raise InputError(f"the study {name!r} needs {known}, not {observer!r}", source="--observer")
-    if count and observer in IMAGE_OBSERVERS:
-        raise InputError("people are observed by ray optics only", source="--observer")
+    if options.image_people is not None and not (count and observer in IMAGE_OBSERVERS):
+        raise InputError("needs people and an observer of images", source="--image-people")
     preset = Population(options.population or study.population or "adults").preset
     protocols = (options.protocol,) if options.protocol in study.protocols else tuple(study.protocols)
     return StudyPlan(
@@ -158,7 +163,10 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
         people=tuple({"preset": preset, "seed": PEOPLE_SEED, "subject": k} for k in range(count)),
         protocols=protocols,
         observer=observer,
-        observings=tuple(Observing(kind) for kind in _kinds(observer, options.noise)),
+        observings=tuple(
+            Observing(kind=kind, spp=options.spp, backend=options.backend, threads=options.threads)
+            for kind in _kinds(observer, options.noise)
+        ),
     )
 
 
@@ -192,7 +200,7 @@ def _settings(name: str, plan: StudyPlan) -> dict[str, Any]:
 def _with_images(study: Study, name: str, plan: StudyPlan, progress: Progress | None, say: Say | None) -> StudyPlan:
     """Make the images that a plan needs, and give them to its observers."""
     kinds = [one.kind for one in plan.observings]
-    if not {"image", "image-noiseless"} & set(kinds):
+    if not {"image", "image-noiseless"} & set(kinds) or not plan.eyes:
         return plan
     scenes = []
     for eye in plan.eyes:

@@ -15,7 +15,7 @@ of the run. Methods add findings and sections, or replace what is observed and e
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -38,6 +38,7 @@ from .literature import MODELS, VARIANTS
 from .observers_compared import compare_observers
 from .observing import Observing
 from .options import StudyOptions
+from .over_people import Experiment, Groups, line_of, listed, people_rows
 from .page_parts import (
     Apart,
     budget_section,
@@ -113,6 +114,7 @@ class Study:
         population: preset from which people are drawn; None if the study draws none.
         observers: observers that can be chosen; the first is the default.
         protocols: names of the readings of a paper.
+        of_models: whether findings and sections are about eye models alone, and people have a table.
         facing: whether cameras are turned to the eyes for images.
         shown: names of the estimators in figures of the error budget and of the observers; empty for all.
         method: the algorithm in words, for the error budget.
@@ -131,6 +133,7 @@ class Study:
     population: ClassVar[str | None] = "adults"
     observers: ClassVar[Sequence[str]] = ("analytic", "image", "both")
     protocols: ClassVar[Sequence[str]] = ("own",)
+    of_models: ClassVar[bool] = False
     facing: ClassVar[bool] = False
     shown: ClassVar[Sequence[str]] = ()
     method: ClassVar[str] = "the estimator"
@@ -143,7 +146,11 @@ class Study:
         for observing in plan.observings:
             shared: dict[str, Any] = {"protocols": plan.protocols, "observing": observing}
             out += [StudyJob(who=eye, **shared) for eye in plan.eyes]
-            out += [StudyJob(who=name_of(person), person=person, **shared) for person in plan.people]
+            if observing.kind != "analytic":
+                # Images of people are not kept: they are rendered within the job.
+                shared["observing"] = replace(observing, images=None, noise_seeds=0)
+            some = plan.people[: plan.options.image_people if observing.kind != "analytic" else None]
+            out += [StudyJob(who=name_of(person), person=person, **shared) for person in some]
         return out
 
     def parts(self, plan: StudyPlan, progress: Progress | None = None) -> Sequence[Any]:
@@ -223,6 +230,23 @@ class Study:
         """Return what the summary holds besides rows, error budget and observers."""
         return {}
 
+    def groups(self, part: Any) -> Groups:
+        """Return a person's errors by condition, for the results over people; by default those of the estimators."""
+        found: Groups = part.errors
+        return found
+
+    def measured(self) -> Mapping[str, Experiment]:
+        """Return what an experiment found, by condition; by default nothing."""
+        return {}
+
+    def tables(self, parts: Sequence[Any]) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+        """Return tables for summary, page and CSV files: by default what was found over people."""
+        by: dict[str, dict[tuple[str, str], Any]] = {}
+        for part in parts:
+            if part.person is not None:
+                by.setdefault(part.eye_model, {}).update(self.groups(part))
+        return {"people": people_rows(by, self.measured())} if by else {}
+
     def cards(self, parts: Sequence[Any], apart: Apart) -> Sequence[Card]:
         """Return the page's first numbers; `apart` compares the observers."""
         out = []
@@ -235,6 +259,8 @@ class Study:
     def sections(self, parts: Sequence[Any]) -> Sequence[Section]:
         """Return the page's own sections; by default the error over the conditions."""
         names = list(self.conditions)
+        if not any(part.rows for part in parts):
+            return []
         if len(names) < 2:
             return [rows_section(parts)]
         panels: dict[str, dict[str, list[float]]] = {}
@@ -261,21 +287,24 @@ class Study:
 
     def report(self, parts: Sequence[Any], protocols: Sequence[str]) -> StudyReport:
         """Compose findings, summary and page."""
-        apart = compare_observers(parts)
+        own = [p for p in parts if p.person is None] if self.of_models else list(parts)
+        apart = compare_observers(own)
         made_of = budgets([p for p in parts if p.person is None and p.eye_model not in VARIANTS])
-        found, faults = self.findings(parts), self.errata(parts)
+        found, faults = (self.findings(own) if own else []), self.errata(own)
+        listing = {name: rows for name, rows in self.tables(parts).items() if rows}
         steps: list[WaterfallStep] = [step for part in parts for step in part.waterfall]
         shown = tuple(self.shown) or tuple(dict.fromkeys(b.estimator for b in made_of))[:4]
         sections = [
             budget_section(made_of, shown, self.method),
-            *self.sections(parts),
+            *(self.sections(own) if own else ()),
+            *(listed(name, rows) for name, rows in listing.items()),
             observers_section(apart, shown),
             findings_section(found) if found else None,
             waterfall_section(steps, self.departures, self.measures),
             errata_section(self.departures, faults) if self.departures else None,
         ]
         features, gaze = apart
-        more = self.more(parts, protocols)
+        more = (self.more(own, protocols) if own else {}) | listing
         more |= {"error_budget": [{**asdict(b), "terms": list(map(asdict, b.terms))} for b in made_of]}
         if self.departures:
             more |= {name: list(map(asdict, some)) for name, some in
@@ -288,8 +317,9 @@ class Study:
             rows=[row for part in parts for row in part.rows],
             findings=found,
             more=more,
-            tables={"waterfall.csv": (header, lines)} if self.departures else {},
-            page=Page(self.title, self.about, self.cards(parts, apart), sections),
+            tables=({"waterfall.csv": (header, lines)} if self.departures else {})
+            | {f"{name}.csv": (list(rows[0]), [list(row.values()) for row in rows]) for name, rows in listing.items()},
+            page=Page(self.title, self.about, self.cards(own, apart), sections),
         )
 
     def text(self, summary: Mapping[str, Any]) -> list[str]:
@@ -302,7 +332,8 @@ class Study:
                 f"{row['protocol']:<12} {row['observer']:<15} {row['eye_model']:<18} {row['eye']:<6} {mean:>9} "
                 f"{row['n']:>4}  {condition}"
             )
-        return lines
+        people = [line_of(row) for row in summary.get("people", ())]
+        return people if people and (self.of_models or len(lines) == 1) else lines
 
 
 def _part(study: Study, job: StudyJob) -> Any:

@@ -141,11 +141,7 @@ def write_json(path: str | Path, data: Any, *, sync: bool = True) -> None:
 
 
 def sync_file(path: str | Path) -> None:
-    """Make a file's content durable.
-
-    Raises:
-        OSError: the file cannot be synced.
-    """
+    """Make a file's content durable; OSError if the file cannot be synced."""
     _sync(path, os.O_RDONLY)
 
 
@@ -213,11 +209,7 @@ def exchange_folders(one: Path, other: Path) -> None:
 
 
 def remove_file(path: str | Path) -> None:
-    """Remove a file durably, if there is one.
-
-    Raises:
-        OSError: the file cannot be removed.
-    """
+    """Remove a file durably, if there is one; OSError if the file cannot be removed."""
     path = Path(path)
     try:
         path.unlink()
@@ -227,22 +219,14 @@ def remove_file(path: str | Path) -> None:
 
 
 def remove_parts(path: str | Path) -> None:
-    """Remove temporary files that killed writers of a file left beside it.
-
-    Raises:
-        OSError: a file cannot be removed.
-    """
+    """Remove temporary files that killed writers of a file left beside it; OSError if a file cannot be removed."""
     path = Path(path)
     for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
         part.unlink(missing_ok=True)
 
 
 def sync_files(paths: Sequence[Path]) -> None:
-    """Make the content of files durable, in several threads as in `sync_tree`.
-
-    Raises:
-        OSError: a file cannot be synced.
-    """
+    """Make the content of files durable, in several threads as in `sync_tree`; OSError if a file cannot be synced."""
     with ThreadPoolExecutor(8) as threads:
         for _ in threads.map(sync_file, paths):
             pass
@@ -395,11 +379,7 @@ def read_table(
 
 
 def parse_json(text: str | bytes, *, source: str = "", path: str = "") -> Any:
-    """Parse a JSON value: finite numbers only, integers of at most 300 digits.
-
-    Raises:
-        InputError: the text is not valid.
-    """
+    """Parse a JSON value: finite numbers only, integers of at most 300 digits; InputError if the text is not valid."""
     try:
         data, text = (text, text.decode()) if isinstance(text, bytes) else (text.encode(errors="replace"), text)
         # Checking each number takes longer than everything else, so it is done only if a number is long enough to

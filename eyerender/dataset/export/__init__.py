@@ -141,11 +141,7 @@ def export(
 
 
 def _check_options(format: str, bits: int, encoding: Curve | None, gain: float | None, shuffle: int | None) -> None:
-    """Check that a layout exists and can be written so.
-
-    Raises:
-        InputError: it cannot.
-    """
+    """Check that a layout exists and can be written so; InputError if it cannot."""
     if format not in FORMATS:
         raise InputError(f"must be one of {', '.join(FORMATS)}, not {format!r}", source="--format")
     check(bits, encoding, gain)

@@ -56,10 +56,11 @@ def write(items: Items, out: Path) -> None:
             files[split] = stack.enter_context(_Annotations(items, out, f"instances_{split}", CATEGORIES, [SIGMA]))
             own = _Annotations(items, out, f"keypoints_{split}", [eye], sigmas(items.lights))
             points[split] = stack.enter_context(own)
+        terms = {} if items.licence is None else {"license": 1}
         for number, made in enumerate(items.map(partial(_annotated, lights=items.lights)), start=1):
             write_bytes(out / made.split / made.image["file_name"], made.picture, sync=False)
             for annotations in (files, points):
-                annotations[made.split].add_image({"id": number, **made.image})
+                annotations[made.split].add_image({"id": number, **terms, **made.image})
             for mark in made.marks:
                 files[made.split].add_mark(number, mark)
             if made.eye is not None:

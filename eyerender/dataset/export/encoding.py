@@ -113,8 +113,7 @@ STORED = Encoding(16, "stored", 1.0, "none")
 def measured_gain(images: Iterable[tuple[NDArray[Any], int, float]]) -> float:
     """Compute the gain that brings the quantile `SHARE` of all pixels to `LEVEL`: 1 to `LARGEST_GAIN`, to four digits.
 
-    Args:
-        images: counts (h, w), their bit depths and their gammas.
+    Images come as counts (h, w), their bit depths and their gammas.
     """
     counts = np.zeros(65536, dtype=np.int64)
     for image, bit_depth, gamma in images:
@@ -128,11 +127,7 @@ def measured_gain(images: Iterable[tuple[NDArray[Any], int, float]]) -> float:
 
 
 def check(bits: int, curve: str | None, gain: float | None) -> None:
-    """Check the options of an encoding.
-
-    Raises:
-        InputError: they are not valid.
-    """
+    """Check the options of an encoding; InputError if they are not valid."""
     if bits not in (8, 16):
         raise InputError(f"must be 8 or 16, not {bits!r}", source="--bits")
     if curve not in (None, *get_args(Curve)):

@@ -23,7 +23,7 @@ from ...optics.ellipse import Ellipse, signed_distance
 from ...rig.camera import PinholeCamera
 from ...scene.parts import BACKGROUND, IRIS, PUPIL
 from ..selection import scrambled
-from ..training.symmetry import mirrored_lamps
+from ..training.item import mirrored_lamps
 from .encoding import STORED, Encoding
 
 Prepared = TypeVar("Prepared")
@@ -62,11 +62,7 @@ class Item:
 
     @property
     def bit_depth(self) -> int:
-        """Bit depth of the counts in the dataset.
-
-        Raises:
-            InputError: the value is not 1 to 16.
-        """
+        """Bit depth of the counts in the dataset; InputError if the value is not 1 to 16."""
         depth = self.line.get("bit_depth")
         if not isinstance(depth, int) or isinstance(depth, bool) or not 1 <= depth <= 16:
             raise InputError(
@@ -76,11 +72,7 @@ class Item:
 
     @cached_property
     def image(self) -> NDArray[Any]:
-        """Counts of the sensor, (h, w) uint8 or uint16.
-
-        Raises:
-            InputError: the file cannot be read.
-        """
+        """Counts of the sensor, (h, w) uint8 or uint16; InputError if the file cannot be read."""
         return _integers(self.entry.image(), self.entry.folder / self.entry.name)
 
     @property
@@ -233,11 +225,7 @@ class Items:
         self.place = folder.path / METADATA, 0
 
     def survey(self) -> None:
-        """Read all metadata once.
-
-        Raises:
-            InputError: a line is wrong, or two images have the same name.
-        """
+        """Read all metadata once; InputError if a line is wrong, or two images have the same name."""
         splits: Counter[str] = Counter()
         samples = np.empty(len(self), dtype=np.int64)
         names = np.empty(len(self), dtype=np.int64)

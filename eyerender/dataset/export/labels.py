@@ -23,11 +23,7 @@ _ENCODING = ("encoding", "gain", "source_bit_depth")  # of exported pictures
 
 
 def check_packed(folder: ImageFolder) -> None:
-    """Check that a dataset has packed shards.
-
-    Raises:
-        InputError: it has not.
-    """
+    """Check that a dataset has packed shards; InputError if it has not."""
     if not isinstance(folder.entries.lines, PackedLines):
         raise InputError("is not of the layout webdataset; use csv or parquet", source=str(folder.path))
 

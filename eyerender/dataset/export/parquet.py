@@ -75,11 +75,7 @@ def write(items: Items, out: Path) -> str:
 
 
 def libraries(layout: str) -> tuple[Any, Any]:
-    """Import pyarrow and pyarrow.parquet.
-
-    Raises:
-        InputError: pyarrow is not installed.
-    """
+    """Import pyarrow and pyarrow.parquet; InputError if pyarrow is not installed."""
     try:
         return import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError:

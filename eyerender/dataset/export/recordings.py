@@ -17,46 +17,27 @@ USUAL_HZ = 60.0  # rate of a camera that states none
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """A frame of one eye in a sequence.
+    """A frame of one eye in a sequence."""
 
-    Attributes:
-        subject: number of the person.
-        split: name of the split.
-        camera: number of the camera.
-        eye: `right` or `left`.
-        name: name of the camera's recording of this eye: `eye0` (right) or `eye1`, with the number of the camera where
-            several see the eye.
-        rate_hz: frames per second of the camera.
-        time_s: time of the frame's middle.
-        timestamp_s: the time that the camera stored; None if it stores none.
-        truth: values of the columns `TRUTH` of a trace.
-        sight_mm: a point on the line of sight, in the world.
-        sight: unit vector of the line of sight.
-        shown: whether the eye shows its gaze (`gaze_valid` of other exports).
-        screen: the scene's screen, as authored; None if it has none.
-    """
-
-    subject: int
-    split: str
-    camera: int
-    eye: str
+    subject: int  # number of the person
+    split: str  # name of the split
+    camera: int  # number of the camera
+    eye: str  # `right` or `left`
+    # name of the camera's recording of this eye: `eye0` (right) or `eye1`, with the number of the camera where several
+    # see the eye
     name: str
-    rate_hz: float
-    time_s: float
-    timestamp_s: float | None
-    truth: list[Any]
-    sight_mm: list[float]
-    sight: list[float]
-    shown: bool
-    screen: Mapping[str, Any] | None
+    rate_hz: float  # frames per second of the camera
+    time_s: float  # time of the frame's middle
+    timestamp_s: float | None  # the time that the camera stored; None if it stores none
+    truth: list[Any]  # values of the columns `TRUTH` of a trace
+    sight_mm: list[float]  # a point on the line of sight, in the world
+    sight: list[float]  # unit vector of the line of sight
+    shown: bool  # whether the eye shows its gaze (`gaze_valid` of other exports)
+    screen: Mapping[str, Any] | None  # the scene's screen, as authored; None if it has none
 
 
 def moment_of(item: Item) -> Moment:
-    """Return the frame of an image.
-
-    Raises:
-        InputError: the image is no frame of a sequence of one eye.
-    """
+    """Return the frame of an image; InputError if the image is no frame of a sequence of one eye."""
     line, records = item.line, item.line["records"]
     if len(records) != 1 or records[0]["events"] is None:
         raise InputError("shows no frame of a sequence of one eye", source=item.entry.name)

@@ -1,7 +1,8 @@
 """YOLO (Ultralytics): images/SPLIT/*.png, labels/SPLIT/*.txt and data.yaml; places are shares of the image's size.
 
-yolo-seg: a line `class x1 y1 x2 y2 ...` for each connected part of more than a few pixels. Polygons have no holes, so
-the classes contain each other: 0 eye (all that is visible between the lids), 1 iris with the pupil, 2 pupil.
+yolo-seg: a line `class x1 y1 x2 y2 ...` for each class. Polygons have no holes, so the classes contain each other: 0
+eye (all that is visible between the lids), 1 iris with the pupil, 2 pupil. Where lashes or lids part a class, bridges
+without width join its parts of more than a few pixels, as Ultralytics' own converter of COCO does.
 yolo-pose: one object per image, the eye: `0 x y w h` of its box, then x, y and visibility (2 visible, 1 hidden, 0 none)
 of the pupil's centre, the glints and nine landmarks of each lid from the temple to the nose. `flip_idx` renames glints
 by the mirrored places of their lamps; without such a symmetry of the rig it is missing, so trainers do not flip images.
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 import yaml
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from ...base.arrays import Bools, Floats
 from ...base.storage.files import write_bytes
@@ -71,8 +73,8 @@ def _files(item: Item, lines: Callable[[Item], Iterator[str]]) -> tuple[str, str
 def _segments(item: Item) -> Iterator[str]:
     mask = item.mask
     for number, first in enumerate(_FROM):
-        for polygon in polygons(mask >= first):
-            yield " ".join([str(number), *_shares(polygon, mask.shape)])
+        if parts := polygons(mask >= first):
+            yield " ".join([str(number), *_shares(joined(parts), mask.shape)])
 
 
 def _pose(item: Item, lights: int) -> Iterator[str]:
@@ -111,6 +113,18 @@ def polygons(inside: Bools) -> list[Floats]:
         # Points on a straight line between their neighbours are left out.
         turns = (x - np.roll(x, 1)) * (np.roll(y, -1) - y) != (y - np.roll(y, 1)) * (np.roll(x, -1) - x)
         out.append(_drawn_in(outline[turns], part)[:, ::-1] + (columns.start, rows.start))
+    return out
+
+
+def joined(parts: list[Floats]) -> Floats:
+    """Join polygons (n, 2) to one that goes to each next part and back, where the two are nearest."""
+    out, *left = sorted(parts, key=len, reverse=True)
+    while left:
+        trees = [cKDTree(part).query(out) for part in left]
+        k = int(np.argmin([distance.min() for distance, _ in trees]))
+        here = int(np.argmin(trees[k][0]))
+        there = np.roll(left.pop(k), -int(trees[k][1][here]), axis=0)
+        out = np.concatenate([out[: here + 1], there, there[:1], out[here:]])
     return out
 
 

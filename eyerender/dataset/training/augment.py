@@ -26,40 +26,24 @@ class Augmentation:
     Numbers are drawn evenly between limits, those of `scale` and `exposure` evenly in their logarithm. The defaults are
     chosen, not fitted to recorded pictures.
 
-    Attributes:
-        flip: share of the pictures that are mirrored, as by `mirror_left`.
-        crop: share of the picture's width and height that is cut out at random and enlarged.
-        shift: largest shift, as a share of the width and the height.
-        scale: factor of the size.
-        roll_deg: largest turn in the plane of the picture.
-        exposure: factor of the levels.
-        gamma: exponent of the levels.
-        erase: largest number of patches with an even random level, which count as occluders.
-        erase_size: width and height of a patch, as a share of the picture's.
-        blur_px: standard deviation of a Gaussian blur.
-        noise: standard deviation of Gaussian noise, as a share of the full scale.
-        compression: share of the pictures that are compressed as JPEG.
-        quality: quality of the JPEG.
-        seed: another seed gives other changes.
-
     Raises:
         InputError: limits are out of range or in the wrong order.
     """
 
-    flip: float = 0.5
-    crop: Limits = (1.0, 1.0)
-    shift: float = 0.1
-    scale: Limits = (0.8, 1.25)
-    roll_deg: float = 15.0
-    exposure: Limits = (0.6, 1.6)
-    gamma: Limits = (0.7, 1.4)
-    erase: int = 1
-    erase_size: Limits = (0.05, 0.3)
-    blur_px: Limits = (0.0, 1.2)
-    noise: Limits = (0.0, 0.03)
-    compression: float = 0.3
-    quality: Limits = (30.0, 95.0)
-    seed: int = 0
+    flip: float = 0.5  # share of the pictures that are mirrored, as by `mirror_left`
+    crop: Limits = (1.0, 1.0)  # share of the picture's width and height that is cut out at random and enlarged
+    shift: float = 0.1  # largest shift, as a share of the width and the height
+    scale: Limits = (0.8, 1.25)  # factor of the size
+    roll_deg: float = 15.0  # largest turn in the plane of the picture
+    exposure: Limits = (0.6, 1.6)  # factor of the levels
+    gamma: Limits = (0.7, 1.4)  # exponent of the levels
+    erase: int = 1  # largest number of patches with an even random level, which count as occluders
+    erase_size: Limits = (0.05, 0.3)  # width and height of a patch, as a share of the picture's
+    blur_px: Limits = (0.0, 1.2)  # standard deviation of a Gaussian blur
+    noise: Limits = (0.0, 0.03)  # standard deviation of Gaussian noise, as a share of the full scale
+    compression: float = 0.3  # share of the pictures that are compressed as JPEG
+    quality: Limits = (30.0, 95.0)  # quality of the JPEG
+    seed: int = 0  # another seed gives other changes
 
     def __post_init__(self) -> None:
         most = {"flip": 1, "crop": 1, "shift": 1, "roll_deg": 180, "erase": 100, "erase_size": 1, "compression": 1}
@@ -73,13 +57,7 @@ class Augmentation:
                 raise InputError(reason, path=field.name)
 
     def changed(self, item: TrainingItem, size: tuple[int, int] | None, key: Sequence[int]) -> TrainingItem:
-        """Change an item; the changes follow from the seed and `key`.
-
-        Args:
-            item: the item, with its mask.
-            size: (width, height) of the result; default: that of the item.
-            key: numbers from 0 on, such as that of the picture and how often it was changed.
-        """
+        """Change an item with its mask, to a size (width, height) px; changes follow from seed and numbers `key`."""
         rng = np.random.default_rng([self.seed, *key])
         item = mirrored(item) if rng.random() < self.flip else item
         at = self._placement(rng, item.size, item.size if size is None else size)

@@ -19,15 +19,10 @@ _SLIPS_MM, _SLIPS_RAD = 0.05, 1e-3  # motion of the rig within a clip that count
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clips:
-    """Windows of `frames` images of one camera at one person, `stride` frames apart, in order of time.
+    """Windows of `frames` images of one camera at one person, `stride` frames apart, in order of time."""
 
-    Attributes:
-        rows: (n, eyes, frames) rows of the folder's images; the eyes are right and left, or one.
-        kinds: (n, 3) whether a clip has each of `KINDS_OF_CLIPS`.
-    """
-
-    rows: Ints
-    kinds: Bools
+    rows: Ints  # (n, eyes, frames) rows of the folder's images; the eyes are right and left, or one
+    kinds: Bools  # (n, 3) whether a clip has each of `KINDS_OF_CLIPS`
 
     @classmethod
     def of(cls, folder: ImageFolder, rows: Ints, *, frames: int, stride: int, both_eyes: bool) -> Clips:

@@ -13,15 +13,59 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...base.arrays import Bools, Bytes, Floats, Ints
 from ...base.errors import InputError
+from ...base.storage.files import parse_json
+from ...optics.transforms import rotated
 from ...population.people import SOLVED
 from ...population.table import default_table
 from ...region.mesh import LID_MARKS
 from ...rig.camera import PinholeCamera
+from ...rig.mount import Mount
 from ...scene.observation import EYES
-from .symmetry import rig_pose
+
+_NEAR_MM = 1.0  # farther than tolerances of assembly
+_NEAR = 0.25  # of the distance between neighbouring lamps
+
+
+def rig_pose(line: Mapping[str, Any]) -> tuple[Floats, Floats]:
+    """Return the pose R (3, 3), t (3,) mm of a picture's rig in the world, x_world = R x_rig + t."""
+    pose = line.get("rig_pose")
+    if pose is not None:  # includes the mount
+        return Rotation.from_rotvec(pose["rotation_rad"]).as_matrix(), np.array(pose["translation_mm"], dtype=float)
+    text = line["parameters"]["scene_json"]
+    mount = parse_json(text, path="scene_json")["rig"].get("mount") if '"mount"' in text else None
+    return (np.eye(3), np.zeros(3)) if mount is None else Mount.from_mapping(mount).motion()
+
+
+def mirrored_lamps(line: Mapping[str, Any]) -> Ints | None:
+    """Return the number (n,) that each lamp of a rig has in the mirrored picture, or None without such a symmetry.
+
+    A rig for both eyes is symmetric about the median plane of the head: a lamp of the left eye becomes the one of the
+    right eye. A rig for one eye is symmetric about the plane of the camera's axis and its vertical.
+    """
+    lights = np.array(line["labels"]["lights_mm"], dtype=float)
+    R, t = rig_pose(line)
+    camera = PinholeCamera.from_labels(line["labels"]["camera"])
+    found = partners((lights - t) @ R, 1)
+    return partners(rotated(camera.sensor_axes, lights) + camera.sensor_offset, 0) if found is None else found
+
+
+def partners(points: Floats, axis: int) -> Ints | None:
+    """Return which of the points (n, 3) mm is the mirror image of each at the plane across an axis; None without one.
+
+    A lamp may be off by 1 mm, and by a quarter of the smallest distance between two lamps.
+    """
+    between = np.linalg.norm(points[:, None] - points, axis=-1)
+    np.fill_diagonal(between, np.inf)
+    limit = min(_NEAR_MM, _NEAR * float(between.min(initial=np.inf)))
+    away = np.linalg.norm(points[:, None] * np.where(np.arange(3) == axis, -1.0, 1.0) - points, axis=-1)
+    nearest = away.argmin(axis=1) if len(points) else np.zeros(0, dtype=int)
+    own = np.arange(len(points))
+    return nearest if np.all(away[own, nearest] <= limit) and np.array_equal(nearest[nearest], own) else None
+
 
 PICTURES = {
     "image": "images",
@@ -72,25 +116,16 @@ PixelsOf = Callable[[str], NDArray[Any] | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingItem:
-    """One picture with labels.
+    """One picture with labels."""
 
-    Attributes:
-        parts: the requested parts by name; pictures are (h, w) or (h, w, channels).
-        size: (width, height) px.
-        shown: (2,) visible share of pupil and iris. What lies outside the picture or under a patch is not visible.
-        there: whether the picture shows an eye, open or shut.
-        mask: (h, w) visible parts of the eye, needed where a part of the picture may be cut off.
-        lamps: (n,) number that each lamp has in the mirrored picture; None if it keeps its own.
-        mirrored: whether picture and labels are mirrored.
-    """
-
-    parts: dict[str, Any]
-    size: tuple[int, int]
+    parts: dict[str, Any]  # the requested parts by name; pictures are (h, w) or (h, w, channels)
+    size: tuple[int, int]  # (width, height) px
+    # (2,) visible share of pupil and iris. What lies outside the picture or under a patch is not visible.
     shown: Floats
-    there: bool = True
-    mask: Bytes | None = None
-    lamps: Ints | None = None
-    mirrored: bool = False
+    there: bool = True  # whether the picture shows an eye, open or shut
+    mask: Bytes | None = None  # (h, w) visible parts of the eye, needed where a part of the picture may be cut off
+    lamps: Ints | None = None  # (n,) number that each lamp has in the mirrored picture; None if it keeps its own
+    mirrored: bool = False  # whether picture and labels are mirrored
 
     def valid(self) -> dict[str, Bools]:
         """Return which labels mean anything, by part: a flag for an ellipse, a vector, a place or a plain number."""
@@ -117,14 +152,9 @@ class TrainingItem:
 
 
 def part_of(part: str, line: Mapping[str, Any], picture: PixelsOf, *, linear: bool, lights: int | None) -> Any:
-    """Read a part of a picture from its line and its pixels.
+    """Read one of `PARTS` of a picture from its line (`eyerender/image/5`) and its pixels by kind of picture.
 
-    Args:
-        part: one of `PARTS`.
-        line: the line of metadata (`eyerender/image/5`).
-        picture: returns the pixels of a kind of picture, None where there are none.
-        linear: whether the camera's gamma is undone.
-        lights: number of rows of `glints`; None: the number of the rig's lamps.
+    `linear` undoes the camera's gamma; `lights` is the number of rows of `glints`, by default that of the rig's lamps.
 
     Raises:
         KeyError: there is no such picture, or the line lacks a key.

@@ -73,21 +73,13 @@ def _tangential(camera: Mapping[str, Any]) -> list[int]:
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Where a picture goes on a canvas: x' = s Q x + d, in px with pixel centres at integers.
+    """Where a picture goes on a canvas: x' = s Q x + d, in px with pixel centres at integers."""
 
-    Attributes:
-        scale: s.
-        turn_rad: angle of Q, from +x towards +y (clockwise on the screen).
-        offset: d (2,).
-        size: (width, height) of the canvas.
-        patches: rectangles of the canvas that are covered.
-    """
-
-    scale: float
-    turn_rad: float
-    offset: Floats
-    size: tuple[int, int]
-    patches: tuple[Patch, ...] = ()
+    scale: float  # s
+    turn_rad: float  # angle of Q, from +x towards +y (clockwise on the screen)
+    offset: Floats  # d (2,)
+    size: tuple[int, int]  # (width, height) of the canvas
+    patches: tuple[Patch, ...] = ()  # rectangles of the canvas that are covered
 
     @classmethod
     def about(

@@ -11,33 +11,24 @@ import numpy as np
 from ...base.errors import WRONG, InputError
 from ..draws import is_draw
 from .augment import Augmentation
-from .item import PARTS, PICTURES, PixelsOf, TrainingItem, part_of, pixels_of
+from .item import PARTS, PICTURES, PixelsOf, TrainingItem, mirrored_lamps, part_of, pixels_of
 from .place import Placement, mirrored, placed
-from .symmetry import mirrored_lamps
 
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
     """What becomes of each picture.
 
-    Attributes:
-        parts: names of `PARTS`.
-        encoding: `stored` or `linear`.
-        size: (width, height) of the result; None: that of the picture.
-        lights: number of rows of `glints`; None: the number of the rig's lamps.
-        mirror_left: whether pictures of left eyes are mirrored.
-        augment: random changes.
-
     Raises:
         InputError: no part is named, one is unknown, or a value is out of range.
     """
 
-    parts: tuple[str, ...]
-    encoding: str = "stored"
-    size: tuple[int, int] | None = None
-    lights: int | None = None
-    mirror_left: bool = False
-    augment: Augmentation | None = None
+    parts: tuple[str, ...]  # names of `PARTS`
+    encoding: str = "stored"  # `stored` or `linear`
+    size: tuple[int, int] | None = None  # (width, height) of the result; None: that of the picture
+    lights: int | None = None  # number of rows of `glints`; None: the number of the rig's lamps
+    mirror_left: bool = False  # whether pictures of left eyes are mirrored
+    augment: Augmentation | None = None  # random changes
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -66,12 +57,9 @@ class Preparation:
         return self.flags or not set(self.parts) <= PICTURES.keys()
 
     def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:
-        """Read an item; left eyes are mirrored if asked for.
+        """Read an item from its line (`eyerender/image/5`; `where` in messages) and its pixels by kind of picture.
 
-        Args:
-            line: the line of metadata (`eyerender/image/5`).
-            picture: returns the pixels of a kind of picture; None where there are none.
-            where: names the line in messages.
+        Left eyes are mirrored if asked for.
 
         Raises:
             InputError: a picture or a label is missing or wrong.

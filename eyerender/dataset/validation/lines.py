@@ -15,9 +15,21 @@ from ...base.arrays import Ints
 from ...base.errors import WRONG, InputError
 from ...base.status import Status
 from ...base.storage.files import shown
-from ...folders.imagefolder import DATASET, METADATA, ImageEntry, ImageFolder
+from ...folders.imagefolder import (
+    DATASET,
+    DATASET_SCHEMA,
+    LINES,
+    METADATA,
+    SHARDS,
+    ImageEntry,
+    ImageFolder,
+    finished,
+    shard_name,
+)
 from ...rig.plausibility import EXPOSURE_REMEDY
 from ...scene.observation import Observations
+from ..done import read_done
+from ..lines import ShardLines
 from .problems import FolderProblems
 from .truth import DatasetTruth, SceneTruth
 
@@ -181,3 +193,26 @@ def _keys(line: dict[str, Any]) -> tuple[set[str], set[str]]:
 def hashed(data: bytes) -> int:
     """Return a 64-bit hash."""
     return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")
+
+
+def compare_lines(images: ImageFolder, problems: FolderProblems) -> None:
+    """Compare the lines of each shard in metadata.jsonl with those that were made, whatever the order of shards.
+
+    A folder of packed shards, or of an unfinished run, has no metadata.jsonl. The lines of one shard are in memory.
+    """
+    if images.unfinished or images.dataset["schema"] != DATASET_SCHEMA:
+        return
+    lines, shards = ShardLines.index(images.path), finished(images.path)
+    for shard in sorted(lines.places.keys() | shards):
+        count = len(lines.places.get(shard, ()))
+        if shard not in shards:
+            problems.add(f"{METADATA}: {count} lines are of shard {shard}, which is not there")
+            continue
+        try:
+            done = read_done(images.path, shard)
+            sums = done["files"].get(f"{SHARDS}/{shard_name(shard)}/{LINES}", {})
+            if hashlib.sha256(b"".join(lines.of(shard))).hexdigest() != sums.get("sha256"):
+                said = "differ from what was made" if count == done["images"] else f"are {count}, not {done['images']}"
+                problems.add(f"{METADATA}: the lines of shard {shard} {said}")
+        except InputError:
+            continue  # other checks report the file

@@ -13,8 +13,8 @@ from ...base.progress import Progress
 from ...base.storage.files import shown
 from ...folders.imagefolder import ARRAY_KEYS, KINDS, ImageEntry, ImageFolder
 from ..done import cpu_family, read_done, run_versions
+from ..environment import rounding
 from ..maker import Maker
-from ..rounding import rounding
 from .problems import FolderProblems
 from .truth import DatasetTruth
 

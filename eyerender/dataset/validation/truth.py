@@ -18,16 +18,13 @@ from ...base.arrays import Bools, Floats, finite_or_none
 from ...base.errors import WRONG, InputError
 from ...base.storage.files import parse_json, shown
 from ...folders.imagefolder import DATASET, FILE_KEYS, KINDS, RESULTS, ImageFolder, shard_name, versions
-from ...imaging.labels import EyeInWindow, known_labels, limbus_px
+from ...imaging.labels import EyeInWindow, glint_shifts_px, known_labels, lid_landmarks, limbus_px
 from ...imaging.lines import image_line
-from ...region.mesh import lid_margins
 from ...rendering.glints.tracing import GlintScene, glint_table
-from ...rendering.records.job import film_index, globe_of
-from ...rendering.scene.pixels import lid_margins_px
+from ...rendering.records.job import film_index
 from ...scene import Frames, Scene
 from ...scene.observation import EYES, Observations
 from ...scene.spec import SceneSpec
-from ...scene.viewer import past_lenses
 from ..done import picture_file
 from ..ownscenes import GivenScene
 from ..plan import Plan, plan_digest
@@ -148,7 +145,7 @@ class DatasetTruth:
         scene, view = frames.scene, EyeInWindow.of(frames, row)
         _, expected = sample_line(found, row, self.frames, view.window, known_labels(scene, observations, view))
         problems = _differences(_open(expected), _open(line))
-        problems += [*_spots(scene, view, line), *_lids(scene, view, line)]
+        problems += [*_spots(scene, view, observations, line), *_lids(scene, view, line)]
         return Again(tuple(problems), _limbus(scene, view))
 
     def remember(self, lines: Mapping[int, dict[str, Any]]) -> None:
@@ -213,7 +210,7 @@ class SceneTruth:
         (own,) = found.take([row]).records()
         stored = {"timestamp_s": finite_or_none(found.index.timestamp_s[row])}
         expected = image_line(scene, own, view.window, known_labels(scene, found, view), sample=stored)
-        problems = [*_differences(_open(expected), _open(line)), *_spots(scene, view, line)]
+        problems = [*_differences(_open(expected), _open(line)), *_spots(scene, view, found, line)]
         problems += _lids(scene, view, line)
         return Again(tuple(problems), _limbus(scene, view))
 
@@ -263,7 +260,7 @@ def _limbus(scene: Scene, view: EyeInWindow) -> Floats | None:
     return points if reason is None else None
 
 
-def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:
+def _spots(scene: Scene, view: EyeInWindow, truth: Observations, line: dict[str, Any]) -> Iterator[str]:
     """Check the spots of the glints: each is the mean of the lamp's image, or lies within it if a part is hidden."""
     eye, camera = view.eye, view.rig.cameras[view.camera]
     lenses = tuple(lens.behind(view.M, view.t - view.apex_mm) for lens in eye.worn)
@@ -273,30 +270,23 @@ def _spots(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[st
     glints = mirror.glints(lights, images, _all_clear)
     picture = scene.spec.image
     # The glints of a meshed cornea are off by some thousandths of a pixel at the default edge of 0.1 mm.
+    shifts = glint_shifts_px(scene, view, truth)
     spare = SPOT_PX + (2 * picture.mesh_edge_mm**2 if picture.surfaces == "mesh" else 0.0)
     for place, whole, glint in zip(glint_table(glints).xy_px, glints, line["labels"]["glints"], strict=True):
         spot, spots = glint["spot_xy_px"], whole.spots
         if spot is None:
             continue
+        shift = shifts[glint["light"]]
         if len(spots.energy) == 0:
             yield f"the spot of light {glint['light']} is at {spot}, but its cornea reflects nothing to the camera"
             continue
-        low = high = place
+        low = high = place + shift
         if "occluded" in str(glint["hidden_by"]):
             reach = np.concatenate([spots.xy_px, whole.image.xy_px[whole.image.there]])
-            low, high = reach.min(axis=0), reach.max(axis=0)
+            low, high = reach.min(axis=0) + shift, reach.max(axis=0) + shift
         if not (np.all(spot >= low - spare) and np.all(spot <= high + spare)):
             x, y = (float(v) for v in (low + high) / 2)
             yield f"computed again: the spot of light {glint['light']} is at {spot}, not at [{x:.3f}, {y:.3f}]"
-
-
-def lid_landmarks(scene: Scene, view: EyeInWindow) -> dict[str, list[list[float]]] | None:
-    """Compute the landmarks along the lids in px, without an image; None for a bare eye and for a head mesh."""
-    if view.region is None or view.region.head is not None:
-        return None
-    margins = lid_margins(view.region, globe_of(view.eye, view.M, view.t - view.apex_mm))
-    camera = past_lenses(view.rig.cameras[view.camera], view.eye.worn, view.apex_mm)
-    return lid_margins_px(margins, camera, view.apex_mm)
 
 
 def _lids(scene: Scene, view: EyeInWindow, line: dict[str, Any]) -> Iterator[str]:

@@ -21,7 +21,7 @@ from ..result import GlintResult
 from ..settings import ExtractionSettings
 from ..weights import glint_weights
 from .detection import optics_sigma
-from .fits import SpotFit
+from .fitting import SpotFit
 
 # Largest counted steps by which the background is brighter than the iris; more is not worse, because the sclera is as
 # bright.
@@ -58,25 +58,15 @@ FIRST, SECOND = glint_weights()  # of the features, and of the comparison
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EyeContext:
-    """Properties of the eye by which spots are judged.
+    """Properties of the eye by which spots are judged."""
 
-    Attributes:
-        ellipse: the pupil.
-        blur_px: blur of the pupil's edge.
-        pupil_dn: level inside the pupil.
-        iris_dn: level just outside the pupil.
-        support: visible share of its boundary.
-        clip_dn: level at which the sensor clips.
-        linear: the image.
-    """
-
-    ellipse: Ellipse
-    blur_px: float
-    pupil_dn: float
-    iris_dn: float
-    support: float
-    clip_dn: float
-    linear: Image
+    ellipse: Ellipse  # the pupil
+    blur_px: float  # blur of the pupil's edge
+    pupil_dn: float  # level inside the pupil
+    iris_dn: float  # level just outside the pupil
+    support: float  # visible share of its boundary
+    clip_dn: float  # level at which the sensor clips
+    linear: Image  # the image
 
     @property
     def step_dn(self) -> float:
@@ -97,14 +87,7 @@ class EyeContext:
 def classify_spots(
     fit: SpotFit, patches_px: Floats, eye: EyeContext, settings: ExtractionSettings
 ) -> tuple[tuple[GlintResult, ...], tuple[GlintResult, ...]]:
-    """Divide spots into (accepted, rejected), brightest first.
-
-    Args:
-        fit: the spots.
-        patches_px: (k, 2) peaks of bright patches that are not spots.
-        eye: the eye.
-        settings: settings of the extractor.
-    """
+    """Divide spots into (accepted, rejected), brightest first; `patches_px` (k, 2) are bright patches, not spots."""
     accepted: list[GlintResult] = []
     rejected: list[GlintResult] = []
     reasons = _objections(fit, eye)
@@ -181,21 +164,16 @@ def _surroundings(fit: SpotFit, beyond: Floats, eye: EyeContext) -> tuple[Floats
 
 
 def compared(fit: SpotFit, logit: Floats, top_dn: float, second: Floats | None = None) -> Floats:
-    """Compute the features (n, 6) of spots for the second logit.
+    """Compute the features (n, 6) of n spots for the second logit.
 
-    They are the first logit; whether the spot is not the reference, and if so, the logarithms of its visible light
-    (height times width) and of its visible width over those of the reference; the expected number of glints among
-    other similar spots; and 1. The reference is the brightest of the spots that are rather glints than not: it is
-    brighter than ghosts of the lens and the lamps' images in the tear menisci.
+    They are the first logit (n,); whether the spot is not the reference, and if so, the logarithms of its visible light
+    (height times width) and of its visible width over those of the reference; the expected number of glints among other
+    similar spots; and 1. The reference is the brightest of the spots that are rather glints than not: it is brighter
+    than ghosts of the lens and the lamps' images in the tear menisci. Similar spots count by the first logit, or once
+    more by the second, if its weights `second` (6,) are given.
 
     The flanks of a clipped spot determine its height badly, so only the visible part counts: the height up to `top_dn`,
     and the width from the area above half of it, 2 pi sigma^2 ln(A / (h / 2)) for a Gaussian.
-
-    Args:
-        fit: the n spots.
-        logit: (n,) the first logit, by which similar spots count.
-        top_dn: level at which the sensor clips.
-        second: (6,) weights of the features; given, similar spots are counted again, by the second logit.
     """
     visible = np.minimum(fit.amplitude_dn, np.maximum(top_dn - fit.background_dn, 1.0))
     wide2 = (fit.sigma_px**2 + PIXEL).prod(axis=1) ** 0.5 * (1.0 + np.log2(fit.amplitude_dn / visible))

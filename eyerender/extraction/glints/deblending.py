@@ -13,8 +13,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats
 from ..preprocessing import DN, Image
-from .fits import SpotFit, joined
-from .fitting import UNEXPLAINED, Limits, fit_spots, window_radius
+from .fitting import UNEXPLAINED, Limits, SpotFit, fit_spots, joined, window_radius
 
 Background = Callable[[Floats, Floats], Floats]
 Starts = tuple[Floats, Floats, Floats]
@@ -38,22 +37,12 @@ def _unexplained(fit: SpotFit, noise_dn: float) -> Bools:
 def split_blends(
     linear: Image, known: Background, starts: Starts, fit: SpotFit, widest_px: float, limits: Limits
 ) -> tuple[Starts, SpotFit]:
-    """Replace each unexplained spot by two if two fit it much better.
+    """Replace each unexplained spot by two if two fit it much better; starts and fits are those of `fit_spots`.
 
     Two spots less than 2.5 sigma apart have one maximum. Their patch is elongated, and one Gaussian leaves a residual
     of several times the noise. The two halves start one standard deviation either way along the longer axis. They must
-    become round and reduce the residual to 60 %.
-
-    Args:
-        linear: the image, DN.
-        known: returns the background B at pixels x and y.
-        starts: xy (n, 2), width (n,) and height (n,), as given to `fit_spots`.
-        fit: their fits.
-        widest_px: largest standard deviation of a glint. A patch that two such cannot form is left alone.
-        limits: noise, clip level and the prior of the slope.
-
-    Returns:
-        Starts and fits, with the halves in place of the spots that were split.
+    become round and reduce the residual to 60 %. A patch that two glints of the standard deviation `widest_px` cannot
+    form is left alone.
     """
     if fit.converged.size > MOST:
         return starts, fit

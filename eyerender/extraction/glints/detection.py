@@ -32,13 +32,9 @@ _COMPASS_COS, _COMPASS_SIN = np.cos(np.arange(12) * (np.pi / 6.0)), np.sin(np.ar
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Spots:
-    """Detected spots.
+    """Detected spots: peaks (n, 2), standard deviations (n,) by the area above half the height, and heights (n,).
 
-    Attributes:
-        xy_px: (n, 2) peak pixels.
-        width_px: (n,) standard deviation, estimated from the area above half the height.
-        height_dn: (n,) height above the surroundings.
-        patches_px: (k, 2) peaks of bright patches that are not spots.
+    `patches_px` (k, 2) are peaks of bright patches that are not spots.
     """
 
     xy_px: Floats
@@ -50,14 +46,9 @@ class Spots:
 def detect_spots(
     prepared: Prepared, ellipse: Ellipse, step_dn: float, blur_px: float, settings: ExtractionSettings
 ) -> Spots:
-    """Detect local maxima that stand out from their surroundings (white top-hat).
+    """Detect local maxima within `glint_reach` of the pupil that stand out from their surroundings (white top-hat).
 
-    Args:
-        prepared: the image.
-        ellipse: the pupil, around which to search.
-        step_dn: step from pupil to iris, DN.
-        blur_px: blur of the pupil's edge.
-        settings: settings; `glint_reach` limits the search.
+    The step from pupil to iris is in DN, the blur of the pupil's edge in px.
     """
     linear = prepared.linear
     reach = search_reach(ellipse, settings)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +23,39 @@ from ...base.jit import compiled, inlined
 from ..preprocessing import DN, Image
 from ..products import add_products, copy, largest_size, solve
 from .detection import SMOOTH_PX
-from .fits import SpotFit
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SpotFit:
+    """A batch of fitted spots."""
+
+    xy_px: Floats  # (n, 2) centres
+    covariance: Floats  # (n, 2, 2) of the centres, px^2
+    amplitude_dn: Floats  # (n,) peak above the background
+    sigma_px: Floats  # (n, 2) standard deviations along x and y
+    background_dn: Floats  # (n,) level of the background at the centre
+    residual_dn: Floats  # (n,) root mean square over the window
+    # (n, 2, 2) second moments of the bright patch: those of the Gaussian if it explains the pixels, else those of the
+    # part above a third of the height, without background and other spots
+    moments_px2: Floats
+    clipped: Indices  # (n,) number of clipped pixels
+    converged: Bools  # (n,) whether the fit converged
+
+    def taken(self, index: Indices) -> SpotFit:
+        """Select the spots with these indices."""
+        return SpotFit(**{one.name: getattr(self, one.name)[index] for one in fields(self)})
+
+    def replaced(self, index: Indices, other: SpotFit) -> SpotFit:
+        """Copy, with the spots at these indices replaced by those of `other`."""
+        order = np.arange(self.converged.size)
+        order[index] = order.size + np.arange(index.size)
+        return joined([self, other]).taken(order)
+
+
+def joined(parts: list[SpotFit]) -> SpotFit:
+    """Concatenate several batches."""
+    return SpotFit(**{one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SpotFit)})
+
 
 PARAMETERS = 8  # x, y, ln A, ln sx, ln sy, b0, bx, by
 LARGEST_PX = 20.0  # radius of a window at most
@@ -51,12 +83,9 @@ WINDOWS = "Tuple((i8[::1], i8[:,::1], f8[:,::1], f8[::1]))"  # type for `compile
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Limits:
-    """Image properties that limit a fit of spots.
+    """Image properties that limit a fit of spots: a pixel's noise (standard deviation) and the level of clipping, DN.
 
-    Attributes:
-        noise_dn: standard deviation of a pixel's noise.
-        clip_dn: level at which the sensor clips.
-        slope_dn: prior standard deviation of the background's slope beyond B, DN per px.
+    `slope_dn` is the prior standard deviation of the background's slope beyond B, DN per px.
     """
 
     noise_dn: float
@@ -77,15 +106,9 @@ def fit_spots(
     height_dn: Floats,
     limits: Limits,
 ) -> SpotFit:
-    """Fit all spots of an image.
+    """Fit all spots of an image (DN), given their peaks (n, 2), estimated standard deviations (n,) and heights (n,).
 
-    Args:
-        linear: the image, DN.
-        known: returns the background B at pixels x and y, (k,) each.
-        start_px: (n, 2) detected peaks.
-        width_px: (n,) their estimated standard deviations.
-        height_dn: (n,) their heights.
-        limits: noise, clip level and the prior of the slope.
+    `known` returns the background B at pixels x and y, (k,) each.
     """
     middle, radius = np.rint(start_px), window_radius(width_px)
     first, offset, data = cut_windows(linear, start_px, middle, radius)
@@ -225,13 +248,9 @@ def _light_of_others(windows: Windows, s: int, theta: Floats, gone: Bools, noise
 
 @inlined
 def spot_slopes(windows: Windows, s: int, theta: Floats, rest: Floats) -> Floats:
-    """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of a spot; the last row is the residual.
+    """Compute derivatives (PARAMETERS + 1, k) of the model in the k pixels of spot s; the last row is the residual.
 
-    Args:
-        windows: the windows.
-        s: the spot.
-        theta: (PARAMETERS,) its parameters.
-        rest: (k,) image minus B and the light of other spots in its pixels.
+    `theta` (PARAMETERS,) are its parameters; `rest` (k,) is the image minus B and the light of other spots.
     """
     first, offset, middle, radius = windows
     half, height, out = math.ceil(radius[s] + 0.5), math.exp(theta[2]), np.empty((PARAMETERS + 1, rest.size))

@@ -28,34 +28,20 @@ ROTATION_TO_CORNEA_MM = 5.7
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Assignment:
-    """The light of each glint.
+    """The light of each glint."""
 
-    Attributes:
-        light: (m,) index of every glint's light, -1 for none.
-        reasons: why a glint has no light; None if it has one.
-        residual_px: (m,) distance from the expected position after shift and scale; 0 without a light.
-        shift_px: (2,) shift of the layout that fitted.
-        scale: scale of the layout that fitted.
-    """
-
-    light: Indices
-    reasons: tuple[str | None, ...]
-    residual_px: Floats
-    shift_px: Floats
-    scale: float
+    light: Indices  # (m,) index of every glint's light, -1 for none
+    reasons: tuple[str | None, ...]  # why a glint has no light; None if it has one
+    residual_px: Floats  # (m,) distance from the expected position after shift and scale; 0 without a light
+    shift_px: Floats  # (2,) shift of the layout that fitted
+    scale: float  # scale of the layout that fitted
 
 
 def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLike, lights_mm: ArrayLike) -> Floats:
-    """Compute the points (l, 3) of a sphere that mirror the lights to the camera: the normal bisects both directions.
+    """Compute the points (l, 3) of a sphere that mirror lights (l, 3): the normal bisects both directions.
 
     The fixed-point iteration n <- (unit to camera + unit to light) / |...| from the point centre + radius n contracts
     by about radius / distance.
-
-    Args:
-        centre_mm: (3,) centre of the sphere.
-        radius_mm: its radius.
-        camera_mm: (3,) nodal point of the camera.
-        lights_mm: (l, 3) lights.
     """
     centre, camera = np.asarray(centre_mm, dtype=np.float64), np.asarray(camera_mm, dtype=np.float64)
     lights = np.atleast_2d(np.asarray(lights_mm, dtype=np.float64))
@@ -71,29 +57,21 @@ def mirror_in_sphere(centre_mm: ArrayLike, radius_mm: float, camera_mm: ArrayLik
 
 
 def predict_glints(
-    pupil_px: ArrayLike,
+    pupil_px: ArrayLike,  # (2,) centre of the pupil on the full sensor
     *,
-    K: ArrayLike,
-    R: ArrayLike,
-    t_mm: ArrayLike,
-    lights_mm: ArrayLike,
+    K: ArrayLike,  # (3, 3) camera matrix
+    R: ArrayLike,  # (3, 3) rotation, world to camera
+    t_mm: ArrayLike,  # (3,) translation, world to camera
+    lights_mm: ArrayLike,  # (l, 3) lights
+    # (3,) approximate world position of the corneal apex when the eye looks along +x. If it is not finite, the point
+    # where the pupil's ray meets the plane x = 0 is used.
     eye_mm: ArrayLike,
-    radius_mm: float = CORNEA_RADIUS_MM,
+    radius_mm: float = CORNEA_RADIUS_MM,  # corneal radius
 ) -> tuple[Floats, float]:
     """Predict the image positions of the glints.
 
     The gaze is approximated by the direction from the centre of rotation to the point where the pupil's ray meets the
     sphere on which the entrance pupil moves (or comes nearest to it). The cornea's centre lies in that direction.
-
-    Args:
-        pupil_px: (2,) centre of the pupil on the full sensor.
-        K: (3, 3) camera matrix.
-        R: (3, 3) rotation, world to camera.
-        t_mm: (3,) translation, world to camera.
-        lights_mm: (l, 3) lights.
-        eye_mm: (3,) approximate world position of the corneal apex when the eye looks along +x. If it is not finite,
-            the point where the pupil's ray meets the plane x = 0 is used.
-        radius_mm: corneal radius.
 
     Returns:
         Expected glints (l, 2) in px, and the image scale at the eye in px per mm.
@@ -127,13 +105,14 @@ def predict_glints(
 
 
 def assign_lights(
-    glints_px: ArrayLike,
-    predicted_px: ArrayLike,
+    glints_px: ArrayLike,  # (m, 2) glints
+    predicted_px: ArrayLike,  # (l, 2) expected glints of the rig's lights
     *,
-    shift_sd_px: float,
+    shift_sd_px: float,  # standard deviation of the whole layout's shift
+    # limits of the layout's scale; the default corresponds to corneal radii of 6.6 to 9.2 mm instead of 7.8
     scale_range: tuple[float, float] = (0.85, 1.18),
-    tolerance_px: float = 1.5,
-    slack: float = 0.08,
+    tolerance_px: float = 1.5,  # largest distance in the middle of the layout
+    slack: float = 0.08,  # additional distance as a share of the light's distance from the middle
 ) -> Assignment:
     """Assign glints to lights, given the expected positions of the lights' glints.
 
@@ -143,15 +122,6 @@ def assign_lights(
     Every pairing of one glint with one light, and of two with two, proposes a layout. The other glints are then matched
     one to one. A layout's merit is the number of matches, minus their squared misfits and a penalty for its shift. If
     another layout with different lights comes within 0.25 of the best one, neither is chosen.
-
-    Args:
-        glints_px: (m, 2) glints.
-        predicted_px: (l, 2) expected glints of the rig's lights.
-        shift_sd_px: standard deviation of the whole layout's shift.
-        scale_range: limits of the layout's scale; the default corresponds to corneal radii of 6.6 to 9.2 mm instead of
-            7.8.
-        tolerance_px: largest distance in the middle of the layout.
-        slack: additional distance as a share of the light's distance from the middle.
     """
     glints = np.asarray(glints_px, dtype=np.float64).reshape(-1, 2)
     lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
@@ -193,29 +163,18 @@ def _unassigned(count: int, reason: str | None) -> Assignment:
 
 
 def identify(
-    glints_px: ArrayLike,
-    pupil_px: ArrayLike,
+    glints_px: ArrayLike,  # (m, 2) glints
+    pupil_px: ArrayLike,  # as are the next five, see `predict_glints`
     *,
-    K: ArrayLike,
-    R: ArrayLike,
-    t_mm: ArrayLike,
-    lights_mm: ArrayLike,
-    eye_mm: ArrayLike,
+    K: ArrayLike,  # (3, 3)
+    R: ArrayLike,  # (3, 3)
+    t_mm: ArrayLike,  # (3,)
+    lights_mm: ArrayLike,  # (l, 3)
+    eye_mm: ArrayLike,  # (3,)
+    # standard deviation of the cornea's position across the line of sight, given pupil and `eye_mm`
     position_sd_mm: float = 1.0,
 ) -> Assignment:
-    """Predict the glints and assign them to the lights; all pixels are those of the full sensor.
-
-    Args:
-        glints_px: (m, 2) glints.
-        pupil_px: see `predict_glints`, as are the next five.
-        K: (3, 3).
-        R: (3, 3).
-        t_mm: (3,).
-        lights_mm: (l, 3).
-        eye_mm: (3,).
-        position_sd_mm: standard deviation of the cornea's position across the line of sight, given the pupil and
-            `eye_mm`.
-    """
+    """Predict the glints and assign them to the lights; all pixels are those of the full sensor."""
     lights = np.asarray(lights_mm, dtype=np.float64).reshape(-1, 3)
     if lights.shape[0] == 0:
         return assign_lights(glints_px, np.zeros((0, 2)), shift_sd_px=1.0)
@@ -228,22 +187,14 @@ class _Search:
     """Search for a layout: the glints (m, 2) and lights (l, 2) to match, px, and what is plausible.
 
     A layout places the lights at middle + shift + scale (lights - middle).
-
-    Attributes:
-        glints: the glints.
-        lights: expected glints of the lights.
-        middle: (2,) middle of the lights.
-        reach: (l,) largest distance of a glint from its light.
-        scale_range: limits of the scale.
-        shift_sd: standard deviation of the shift.
     """
 
-    glints: Floats
-    lights: Floats
-    middle: Floats
-    reach: Floats
-    scale_range: tuple[float, float]
-    shift_sd: float
+    glints: Floats  # the glints
+    lights: Floats  # expected glints of the lights
+    middle: Floats  # (2,) middle of the lights
+    reach: Floats  # (l,) largest distance of a glint from its light
+    scale_range: tuple[float, float]  # limits of the scale
+    shift_sd: float  # standard deviation of the shift
 
     def promising(self) -> list[tuple[Floats, float]]:
         """Return the (shift, scale) pairs for which a one-to-one match is worth trying.

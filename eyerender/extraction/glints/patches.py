@@ -17,7 +17,7 @@ from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, Prepared
 from ..pupil.glare import around
 from ..statistics import median
-from .fits import SpotFit, joined
+from .fitting import SpotFit, joined
 
 # Share of the brightest level near the pupil, step between pixels, least pixels of a patch, most patches. First those
 # with a dull middle, as overloaded sensors show bright glints; then saturated ones, some pixels of which compression
@@ -35,13 +35,7 @@ Box = tuple[int, int, int, int]  # first and last column, first and last row
 def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, fit: SpotFit) -> SpotFit:
     """Replace the fits of spots that are patches by patch measurements, and append patches without a spot.
 
-    A patch with a well-fitted spot is left to that fit.
-
-    Args:
-        prepared: the image.
-        ellipse: the pupil.
-        reach_px: distance from the pupil's centre within which patches count.
-        fit: the fits of the spots.
+    Patches count within `reach_px` of the pupil's centre. One with a well-fitted spot is left to that fit.
     """
     columns, rows = around(ellipse.centre_px, reach_px, prepared.linear.shape)
     crop, corner = prepared.linear[rows, columns], np.array([columns.start, rows.start])

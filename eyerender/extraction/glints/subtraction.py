@@ -12,8 +12,7 @@ from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, ImagePart, Prepared
 from ..pupil.glare import around
 from .detection import Spots
-from .fits import SpotFit
-from .fitting import LARGEST_PX, profile
+from .fitting import LARGEST_PX, SpotFit, profile
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.
@@ -56,17 +55,10 @@ def _covered(linear: Image, clip_dn: float, xy: Floats, radius: Floats) -> Bools
 def subtract_spots(
     part: ImagePart, noise_dn: float, fit: SpotFit, which: Bools, about: Ellipse
 ) -> tuple[ImagePart, Bools]:
-    """Subtract the light of spots from the image in the neighbourhood of an ellipse.
+    """Subtract the light of the spots `which` (n,) near an ellipse, the pupil boundary, from the image.
 
     A fit describes the flanks of a spot far better than the circle of `affected_pixels`. Where the light exceeds three
     standard deviations of the noise, the fit is not trusted.
-
-    Args:
-        part: a part of the image.
-        noise_dn: standard deviation of a pixel's noise.
-        fit: the spots' fits.
-        which: (n,) spots to subtract.
-        about: the ellipse, the pupil boundary.
 
     Returns:
         The part without that light, and the mask (h, w) of pixels where the light is too bright.

@@ -65,9 +65,7 @@ def _direct_fit(points: Floats, out: Floats) -> None:
 def _conic_moments(points: Floats, rounding: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Compute moments of p = u^2 + v^2 - 2, q = u^2 - v^2 and r = 2 u v of the whitened points (u, v).
 
-    Args:
-        points: (k, 2).
-        rounding: mean (x, y) of the points, and Cholesky factor (11, 21, 22) of their covariance.
+    `rounding` is the mean (x, y) of the points (k, 2), and the Cholesky factor (11, 21, 22) of their covariance.
 
     Returns:
         The mean products pu, pv, qu, qv, ru, rv, and pp, pq, pr, qq, qr, rr without their part along u and v.

@@ -42,31 +42,19 @@ MOST_CONTOURS = 5000
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Candidate:
-    """A dark blob.
+    """A dark blob."""
 
-    Attributes:
-        ellipse: ellipse with the blob's second moments.
-        inside_dn: level inside.
-        step_dn: step from inside to a ring outside.
-        score: rank of the candidate; higher is better.
-        rough: whether the ellipse comes from a strongly reduced image.
-    """
-
-    ellipse: Ellipse
-    inside_dn: float
-    step_dn: float
-    score: float = 1.0
-    rough: bool = False
+    ellipse: Ellipse  # ellipse with the blob's second moments
+    inside_dn: float  # level inside
+    step_dn: float  # step from inside to a ring outside
+    score: float = 1.0  # rank of the candidate; higher is better
+    rough: bool = False  # whether the ellipse comes from a strongly reduced image
 
 
 def find_candidates(prepared: Prepared, shape: Shape, most: int = 4, *, levels: int = LEVELS) -> list[Candidate]:
     """Return up to `most` candidates, best first; none if nothing dark and round stands out.
 
-    Args:
-        prepared: the image.
-        shape: sizes and shapes to look for.
-        most: number of candidates.
-        levels: number of thresholds at evenly spaced grey levels.
+    They are blobs below thresholds at `levels` evenly spaced grey levels.
     """
     linear, noise_dn = prepared.linear, prepared.noise_dn
     factor = int(min(max(shape.least_px // 3.5, 1), 4))
@@ -362,21 +350,13 @@ def _same(first: Floats, second: Floats) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlobInterior:
-    """Statistics of the pixels inside an ellipse.
+    """Statistics of the pixels inside an ellipse."""
 
-    Attributes:
-        darker_dn: how much darker the middle is than the outer part.
-        error_dn: its standard error; infinite if the ellipse is too small.
-        spread_dn: scatter of the grey levels beyond the image's noise.
-        covered: share of the inner half that glints covered.
-        spot_dn: how much darker than the median the darkest pixels of the inner half are, but for SPECKS of them.
-    """
-
-    darker_dn: float
-    error_dn: float
-    spread_dn: float
-    covered: float
-    spot_dn: float
+    darker_dn: float  # how much darker the middle is than the outer part
+    error_dn: float  # its standard error; infinite if the ellipse is too small
+    spread_dn: float  # scatter of the grey levels beyond the image's noise
+    covered: float  # share of the inner half that glints covered
+    spot_dn: float  # how much darker than the median the darkest pixels of the inner half are, but for SPECKS of them
 
 
 def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> BlobInterior:

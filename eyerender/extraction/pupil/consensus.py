@@ -30,28 +30,17 @@ ALL_SEEN = 0.9  # share of the outline that no lid or lashes hide
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BoundaryFit:
-    """An ellipse fitted to edge points, corrected for curvature.
+    """An ellipse fitted to edge points, corrected for curvature."""
 
-    Attributes:
-        ellipse: the ellipse.
-        inliers: (n,) which edge points it is fitted to.
-        points_px: those points, corrected.
-        support: share of the outline that they cover.
-        gap: share of the outline in the longest stretch without points.
-        residual_px: rms distance of the points.
-        noise_px: the same as noise alone would make it.
-        sums: sums over the points, for the covariance and the leverage.
-        covariance: (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and the hidden part of the outline.
-    """
-
-    ellipse: Ellipse
-    inliers: Bools
-    points_px: Floats
-    support: float
-    gap: float
-    residual_px: float
-    noise_px: float
-    sums: EdgeSums
+    ellipse: Ellipse  # the ellipse
+    inliers: Bools  # (n,) which edge points it is fitted to
+    points_px: Floats  # those points, corrected
+    support: float  # share of the outline that they cover
+    gap: float  # share of the outline in the longest stretch without points
+    residual_px: float  # rms distance of the points
+    noise_px: float  # the same as noise alone would make it
+    sums: EdgeSums  # sums over the points, for the covariance and the leverage
+    # (5, 5) of (cx, cy, a, b, angle), from the scatter of the points and the hidden part of the outline
     covariance: Floats
 
 
@@ -61,13 +50,9 @@ UNEVEN = 0.01
 
 
 def fit_boundary(edges: EdgePoints, candidate: Candidate, shape: Shape, expected_noise_px: float) -> BoundaryFit | str:
-    """Fit the boundary of the pupil, or return the reason why there is none.
+    """Fit the boundary of the pupil to edge points around a dark blob, or return the reason why there is none.
 
-    Args:
-        edges: edge points around the candidate.
-        candidate: the dark blob.
-        shape: accepted sizes and shapes.
-        expected_noise_px: standard deviation of an edge point along its normal.
+    `expected_noise_px` is the standard deviation of an edge point along its normal.
     """
     if edges.points_px.shape[0] < 8:
         return f"only {edges.points_px.shape[0]} edge points around the darkest blob"
@@ -201,17 +186,11 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float,
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
-    """Select points and refit until the selection settles, in compiled code.
+    """Select points (n, 2) with normals (n, 2) and refit until the selection settles, in compiled code.
 
-    Edge points are moved outward by the curvature shift. The steepest place of a blurred convex edge is sigma^2 kappa /
-    2 inside the true edge.
-
-    Args:
-        points: (n, 2) edge points.
-        normals: (n, 2).
-        start: (5,) centre, semi-axes and angle.
-        sigma_px: width of the whole smoothing.
-        tolerance: largest distance of a selected point, px; twice that for the first selection.
+    Edge points are moved outward by the curvature shift: the steepest place of a blurred convex edge, with the whole
+    smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. Selected
+    points lie within `tolerance` px; twice that at first.
 
     Returns:
         The number of selected points (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points

@@ -60,19 +60,12 @@ def sector_excess(plain: Floats, inverse: Floats, sums: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeSums:
-    """Sums over edge points near an ellipse, over all and over each group of three sectors.
+    """Sums over edge points near an ellipse, over all and over each group of three sectors."""
 
-    Attributes:
-        matrix: (5, 5) sum of products of the distance's slopes.
-        scores: (5, GROUPS) sum of slopes times distance.
-        slopes: (5, GROUPS) sum of slopes.
-        count: (GROUPS,) number of points.
-    """
-
-    matrix: Floats
-    scores: Floats
-    slopes: Floats
-    count: Indices
+    matrix: Floats  # (5, 5) sum of products of the distance's slopes
+    scores: Floats  # (5, GROUPS) sum of slopes times distance
+    slopes: Floats  # (5, GROUPS) sum of slopes
+    count: Indices  # (GROUPS,) number of points
 
     @staticmethod
     def of(ellipse: Ellipse, points: Floats) -> EdgeSums:
@@ -118,13 +111,9 @@ def edge_covariance(sums: EdgeSums, residual_px: float) -> Floats:
 def hidden_part(ellipse: Ellipse, seen: Bools, residual_px: float) -> Floats:
     """Compute the covariance (5, 5) of centre and shape matrix due to unevenness of the hidden part of the outline.
 
-    The ellipse through the visible sectors differs from the one through all sectors by a linear function of the
-    sectors' displacements, which are equal within a group of three sectors and independent between groups.
-
-    Args:
-        ellipse: the ellipse through the visible sectors.
-        seen: (SECTORS,) which sectors are visible.
-        residual_px: root mean square distance of the edge points in them.
+    The ellipse through the visible sectors (SECTORS,) differs from the one through all sectors by a linear function of
+    the sectors' displacements, which are equal within a group of three sectors and independent between groups.
+    `residual_px` is the root mean square distance of the edge points in the visible ones.
     """
     slopes = outline_slopes(ellipse)
     visible = slopes * seen
@@ -140,11 +129,7 @@ def towards_round(ellipse: Ellipse, covariance: Floats) -> tuple[Ellipse, Floats
     """Compute the most likely ellipse and its covariance, given the prior ELONGATION of pupils.
 
     An arc between two lids hardly determines the size across it; a whole outline is not affected. One step of the
-    Kalman filter.
-
-    Args:
-        ellipse: the ellipse that was fitted.
-        covariance: (5, 5) of its centre and shape matrix.
+    Kalman filter, on centre and shape matrix with their covariance (5, 5).
     """
     a, b = ellipse.semi_axes_px.tolist()
     told = np.array([[0.0, 0.0, 1.0, -1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 2.0]])

@@ -38,25 +38,15 @@ _BELL = np.exp(-0.5 * _STEPS**2) / math.sqrt(2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EdgeModel:
-    """The pupil's edge as a blurred step across an ellipse.
+    """The pupil's edge as a blurred step across an ellipse."""
 
-    Attributes:
-        ellipse: the pupil boundary.
-        inner_dn: inner level, DN.
-        outer: (1 + 2 K,) Fourier coefficients of the outer level (1, cos u, sin u, cos 2u, ...), DN.
-        sigma_px: width of the blur.
-        slope: slope of the outer level, DN per px.
-        kurtosis: kurtosis of the blur beyond a Gaussian's 0.
-        lean: (cos u, sin u) coefficients of the inner level, DN.
-    """
-
-    ellipse: Ellipse
-    inner_dn: float
-    outer: Floats
-    sigma_px: float
-    slope: float = 0.0
-    kurtosis: float = 0.0
-    lean: tuple[float, float] = (0.0, 0.0)
+    ellipse: Ellipse  # the pupil boundary
+    inner_dn: float  # inner level, DN
+    outer: Floats  # (1 + 2 K,) Fourier coefficients of the outer level (1, cos u, sin u, cos 2u, ...), DN
+    sigma_px: float  # width of the blur
+    slope: float = 0.0  # slope of the outer level, DN per px
+    kurtosis: float = 0.0  # kurtosis of the blur beyond a Gaussian's 0
+    lean: tuple[float, float] = (0.0, 0.0)  # (cos u, sin u) coefficients of the inner level, DN
 
     def numbers(self) -> Floats:
         """Return the parameters (11 + 1 + 2 K,).
@@ -96,14 +86,8 @@ class EdgeModel:
 class Profile(NamedTuple):
     """The blurred step and ramp across the boundary at one point.
 
-    Attributes:
-        edge: E, from 0 inside to 1 outside.
-        by_distance: its derivative by the distance.
-        by_sigma: its derivative by the standard deviation of the blur.
-        by_kurtosis: its derivative by the kurtosis of the blur.
-        ramp: R, the blurred max(d, 0).
-        ramp_by_distance: its derivative by the distance.
-        ramp_by_sigma: its derivative by the standard deviation of the blur.
+    E, from 0 inside to 1 outside, with its derivatives by the distance, by the standard deviation of the blur and by
+    its kurtosis; then R, the blurred max(d, 0), with the first two.
     """
 
     edge: float
@@ -194,14 +178,9 @@ def turn_harmonics(places: Floats, count: int, basis: Floats) -> None:
 
 @inlined
 def local_levels(places: Floats, count: int, numbers: Floats, basis: Floats, out: Floats) -> None:
-    """Write the levels at `count` places.
+    """Write the levels of the model (see `EdgeModel.numbers`) at `count` of the places (PLACES,) to `out` (LEVELS,).
 
-    Args:
-        places: (PLACES,) the places.
-        count: number of points.
-        numbers: (p,) the model (see `EdgeModel.numbers`).
-        basis: (2 BLOCK,) scratch memory.
-        out: (LEVELS,) the result.
+    `basis` (2 BLOCK,) is scratch memory.
     """
     outer, plane = numbers[11:], 1.0 / math.sqrt(numbers[2] * numbers[3])
     for i in range(count):

@@ -41,23 +41,14 @@ DOUBLE = 0.7  # share of a boundary that recurs in a double image; drawn ones ha
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EdgePoints:
-    """Edge points along a boundary.
+    """Edge points along a boundary."""
 
-    Attributes:
-        points_px: (n, 2) ridge of the gradient, not corrected for curvature.
-        normals: (n, 2) unit normals, from dark to bright.
-        ridge: (m,) rows and (m,) columns of all ridge pixels, before the tests.
-        kept: (m,) which ridge pixels became edge points.
-        sigma_px: width of the whole smoothing (optics, pixel and filter), measured across the edge.
-        filter_px: sigma of the filter alone.
-    """
-
-    points_px: Floats
-    normals: Floats
-    ridge: tuple[Indices, Indices]
-    kept: Bools
-    sigma_px: float
-    filter_px: float
+    points_px: Floats  # (n, 2) ridge of the gradient, not corrected for curvature
+    normals: Floats  # (n, 2) unit normals, from dark to bright
+    ridge: tuple[Indices, Indices]  # (m,) rows and (m,) columns of all ridge pixels, before the tests
+    kept: Bools  # (m,) which ridge pixels became edge points
+    sigma_px: float  # width of the whole smoothing (optics, pixel and filter), measured across the edge
+    filter_px: float  # sigma of the filter alone
 
     def arcs(self) -> Indices:
         """Label the connected pieces on which the points lie, (n,)."""
@@ -75,17 +66,11 @@ def find_edges(
 
     A gradient ridge is kept if it points outward (within 45 deg of the candidate's normal), exceeds the noise, and has
     dark pupil behind it and an iris ahead: nothing as bright as skin or sclera, and no level that keeps rising. The
-    reflection of a window adds its light to both.
+    reflection of a window adds its light to both. No edge point is taken beside inpainted glints.
 
     The sub-pixel position, along the gradient's larger component, is the vertex of the parabola through the logarithms
     of three magnitudes. It is exact for a Gaussian-blurred straight edge. Source: Devernay (1995), with the logarithm.
-
-    Args:
-        inpainted: the image; no edge point is taken beside the glints in it.
-        candidate: the dark blob.
-        noise_dn: standard deviation of a pixel's noise.
-        filter_px: sigma of the derivative filter.
-        band: width of the search, in semi-axes.
+    The derivative filter has the width `filter_px` (sigma).
     """
     ellipse = candidate.ellipse
     b = float(ellipse.semi_axes_px[1])
@@ -205,21 +190,16 @@ def nearest(image: Image, x: float, y: float) -> float:
 
 @compiled("f4[:,::1], f8[:,::1], f8[:,::1], f8, UniTuple(f8, 6)")
 def _at_the_iris(smooth: Image, points: Floats, normals: Floats, depth: float, limits: tuple[float, ...]) -> Bools:
-    """Return which points have pupil behind them and iris ahead of them.
+    """Return which points (n, 2) with outward unit normals (n, 2) have pupil behind them and iris ahead of them.
 
-    A point passes if all of this holds:
+    A point passes if all of this holds, in the smoothed image:
 
     - The level `depth` px behind it is dark. Inside a window's reflection it need only be darker than an iris, if the
       level `depth` px ahead exceeds it by `clear`.
     - The level half of `depth` ahead is not bright, relative to the pupil or to the reflection.
     - From `depth` to 1.5 `depth` ahead, the level rises by less than `rise`.
 
-    Args:
-        smooth: smoothed image (h, w).
-        points: (n, 2) points on the outline, px.
-        normals: (n, 2) unit normals, outwards.
-        depth: distance, px.
-        limits: level of the pupil, and relative to it the limits dark, iris, `clear`, bright and `rise`.
+    `limits` are the level of the pupil, and relative to it dark, iris, `clear`, bright and `rise`.
     """
     pupil, dark, iris, clear, bright, rise = limits
     out = np.empty(points.shape[0], dtype=np.bool_)
@@ -274,14 +254,8 @@ def is_repeated(inpainted: Inpainted, ellipse: Ellipse, edges: EdgePoints, used:
     """Return whether nearly all edge points of a boundary (DOUBLE of them) recur at one distance and direction.
 
     In an exposure across a saccade, the pupil appears twice, and so does most of its edge. An iris, a lid or lamps
-    repeat parts of it only. The image is reduced so that the semi-axis b is COARSE_PX.
-
-    Args:
-        inpainted: the image.
-        ellipse: the boundary.
-        edges: edge points around it.
-        used: (n,) which of them belong to it.
-        blur_px: blur of the edge.
+    repeat parts of it only. The image is reduced so that the semi-axis b is COARSE_PX. `used` (n,) says which edge
+    points belong to the boundary.
     """
     a, b = ellipse.semi_axes_px.tolist()
     scale = max(b / COARSE_PX, 1.0)

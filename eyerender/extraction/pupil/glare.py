@@ -35,19 +35,12 @@ _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * FLANK_PX + 1, 2 * FLAN
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inpainted:
-    """An image in which glints near a candidate are replaced by the level around them.
+    """An image in which glints near a candidate are replaced by the level around them."""
 
-    Attributes:
-        linear: (h, w) the image as it is, DN.
-        corner: column and row of the part that differs.
-        patch: (k, l) that part, DN.
-        mask: (k, l) which of its pixels are replaced.
-    """
-
-    linear: Image
-    corner: tuple[int, int] = (0, 0)
-    patch: Image | None = None
-    mask: Bools | None = None
+    linear: Image  # (h, w) the image as it is, DN
+    corner: tuple[int, int] = (0, 0)  # column and row of the part that differs
+    patch: Image | None = None  # (k, l) that part, DN
+    mask: Bools | None = None  # (k, l) which of its pixels are replaced
 
     def cut(self, columns: slice, rows: slice) -> tuple[Image, Bools]:
         """Cut out a part: its levels, and which of its pixels are replaced."""
@@ -99,15 +92,7 @@ def around(centre: Floats, reach: float, shape: tuple[int, ...]) -> tuple[slice,
 
 
 def inpaint_glints(linear: Image, ellipse: Ellipse, inside_dn: float, step_dn: float, noise_dn: float) -> Inpainted:
-    """Replace glints near an ellipse by the level around them.
-
-    Args:
-        linear: the image, DN.
-        ellipse: the candidate.
-        inside_dn: level inside.
-        step_dn: step from inside to outside.
-        noise_dn: standard deviation of a pixel's noise.
-    """
+    """Replace glints near an ellipse by the level around them, given the level inside, the step and the noise."""
     a, b = ellipse.semi_axes_px.tolist()
     columns, rows = around(ellipse.centre_px, 1.4 * a + 8.0, linear.shape)
     crop = np.ascontiguousarray(linear[rows, columns])

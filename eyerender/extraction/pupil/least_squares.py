@@ -47,14 +47,9 @@ class Band:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoundaryPixels:
-    """Pixels near the boundary, sorted by sector.
+    """Pixels near the boundary, sorted by sector: place (n,), level (n,) and place (n,) of their sector in `sector`.
 
-    Attributes:
-        x: (n,) position, px.
-        y: (n,) position, px.
-        level: (n,) level, DN.
-        index: (n,) index of each pixel's sector among the k sectors with pixels.
-        sector: (k,) numbers of these sectors.
+    `sector` (k,) are the numbers of the sectors that have pixels.
     """
 
     x: Floats
@@ -87,12 +82,8 @@ def prior_weights(start: EdgeModel, noise_dn: float, size: int) -> Floats:
 class Sums:
     """Sums of products of the linearised model over the pixels; p parameters, k sectors with pixels.
 
-    "Slopes" are derivatives of a pixel's level with respect to the parameters.
-
-    Attributes:
-        matrix: (p, p) products of slopes.
-        cost: squared residuals.
-        pull: (p, k) slopes times residual, per sector.
+    With slopes, the derivatives of a pixel's level by the parameters: their products (p, p), the squared residuals, and
+    slopes times residual per sector (p, k).
     """
 
     matrix: Floats
@@ -110,17 +101,11 @@ class Sums:
 def _rows(
     places: Floats, profiles: Floats, level: Floats, start: int, count: int, numbers: Floats, out: tuple[Floats, ...]
 ) -> None:  # fmt: skip
-    """Write a block's derivatives of the level by the parameters, and residuals.
+    """Write a block's derivatives of the level by the parameters (see `EdgeModel.numbers`), and residuals.
 
-    Args:
-        places: (PLACES,) the places.
-        profiles: (PROFILES,) the profiles there.
-        level: (n,) levels of all pixels.
-        start: first pixel of the block.
-        count: number of pixels in it.
-        numbers: (p,) the model (see `EdgeModel.numbers`).
-        out: receives the derivatives (p BLOCK,), parameter after parameter in the order of `numbers`, and the residuals
-            (BLOCK,). It ends with scratch memory (BLOCK, 2 BLOCK, and LEVELS).
+    Places and profiles are those of the block, whose first pixel is `start`; levels (n,) are those of all pixels. `out`
+    receives the derivatives (p BLOCK,), parameter after parameter, and the residuals (BLOCK,). It ends with scratch
+    memory (BLOCK, 2 BLOCK, and LEVELS).
     """
     rows, residual, steep, basis, levels = out
     cos, sin, plane = math.cos(numbers[4]), math.sin(numbers[4]), 1.0 / math.sqrt(numbers[2] * numbers[3])
@@ -257,14 +242,9 @@ def _moved(numbers: Floats, step: Floats) -> Floats:
 def _trial(
     matrix: Floats, vector: Floats, held: Floats, numbers: Floats, damping: float
 ) -> tuple[Floats, float, float]:
-    """Take one damped step of at most 3 px.
+    """Take one damped step of at most 3 px from `numbers` (p,), with priors of the weights `held` (p,).
 
-    Args:
-        matrix: (p, p) sum of products of slopes.
-        vector: (p,) sum of slopes times residual.
-        held: (p,) weights of the priors.
-        numbers: (p,) the model (see `EdgeModel.numbers`).
-        damping: added to the diagonal of the scaled normal matrix.
+    The normal equations have the matrix (p, p) and vector (p,); damping is added to the diagonal of the scaled matrix.
 
     Returns:
         The new parameters, and the step's largest change of the shape and of sigma, px.

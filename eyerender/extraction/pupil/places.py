@@ -21,27 +21,16 @@ Value = TypeVar("Value", float, Floats)
 
 
 class EllipsePlaces(NamedTuple, Generic[Value]):
-    """Position relative to an ellipse: of one point, or of n points as arrays.
+    """Position relative to an ellipse: of one point, or of n points as arrays."""
 
-    Attributes:
-        distance: signed distance, px, positive outside.
-        cos_t: cosine of the nearest point's parameter t.
-        sin_t: its sine.
-        nx: outward normal there, in the ellipse's axes.
-        ny: the same.
-        curvature: curvature there, 1/px.
-        cos_u: cosine of u, the parameter counted from the image's x axis.
-        sin_u: its sine.
-    """
-
-    distance: Value
-    cos_t: Value
-    sin_t: Value
-    nx: Value
-    ny: Value
-    curvature: Value
-    cos_u: Value
-    sin_u: Value
+    distance: Value  # signed distance, px, positive outside
+    cos_t: Value  # cosine of the nearest point's parameter t
+    sin_t: Value  # its sine
+    nx: Value  # outward normal there, in the ellipse's axes
+    ny: Value  # the same
+    curvature: Value  # curvature there, 1/px
+    cos_u: Value  # cosine of u, the parameter counted from the image's x axis
+    sin_u: Value  # its sine
 
 
 PLACES = 8 * BLOCK  # numbers in a block of places

@@ -11,11 +11,57 @@ from ...base.arrays import Bools, Floats
 from ...base.jit import compiled
 from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, ImagePart
+from ..statistics import median
+from .consensus import UNEVEN
 from .covariance import SHAPE, hidden_part, sector_excess, to_axes, towards_round
-from .edge_model import EdgeModel
+from .edge_model import EdgeModel, boundary_terms, levels_and_slopes
 from .least_squares import FIXED, Band, BoundaryPixels, Sums, fitted, prior_weights
-from .occlusion import clear_of_lids, visible_part
 from .places import SECTORS, sectors_at
+
+OUTLIER = 5.0  # pixels with a larger residual, in standard deviations, are left out
+FARTHEST = 3.5  # largest displacement of a sector, in standard deviations of what unevenness and noise make likely
+
+
+def visible_part(
+    model: EdgeModel, band: Band, use: Bools, seen: Bools, sectors: Bools, noise_dn: float
+) -> tuple[Bools, Bools]:
+    """Decide which of n pixels of the boundary are not outliers (n,), and which sectors (SECTORS,) the model explains.
+
+    A pupil boundary is not exactly an ellipse. A sector is explained if it is displaced no farther than unevenness and
+    noise make likely, if its mean squared residual is at most a multiple of a typical sector's, and if few of its
+    pixels are outliers. The limits are generous where edge points were found (`sectors`), because iris texture is not a
+    lid, and strict elsewhere. The fit used the pixels `use` (n,) and the sectors `seen`.
+    """
+    numbers, bins = model.numbers(), band.sector
+    expected, slope = levels_and_slopes(boundary_terms(band.x, band.y, numbers)[1], numbers)
+    residual, counted = band.level - expected, slope * use
+    weight = np.bincount(bins, weights=counted * slope, minlength=SECTORS)
+    displaced = np.bincount(bins, weights=counted * residual, minlength=SECTORS) / np.maximum(weight, 1e-9)
+    displaced = np.clip(displaced, -model.sigma_px, model.sigma_px)
+    residual = residual - slope * displaced[bins]
+    scale = max(1.4826 * median(np.abs(residual[use & seen[bins]])), noise_dn, 1e-3)
+    new_use = np.abs(residual) < OUTLIER * scale
+    total = np.maximum(np.bincount(bins, minlength=SECTORS), 1)
+    capped = np.minimum((residual / scale) ** 2, OUTLIER**2)
+    square = np.bincount(bins, weights=capped, minlength=SECTORS) / total
+    outliers = np.bincount(bins, weights=~new_use, minlength=SECTORS) / total
+    usual = max(median(square[seen]), 1.0)
+    explained = (square < np.where(sectors, 5.0, 2.5) * usual) & (outliers < np.where(sectors, 0.25, 0.1))
+    uneven2 = np.where(sectors, UNEVEN**2 * numbers[2] * numbers[3], 0.0)
+    explained &= np.abs(displaced) < FARTHEST * np.sqrt(uneven2 + noise_dn * noise_dn / np.maximum(weight, 1e-9))
+    return new_use, explained
+
+
+def clear_of_lids(seen: Bools, model: EdgeModel) -> Bools:
+    """Exclude the sectors beside each gap of two or more, as far as the blur of a lid margin extends."""
+    if seen.all():
+        return seen
+    gap = ~seen & (~np.roll(seen, 1) | ~np.roll(seen, -1))
+    length = math.pi * float(model.ellipse.semi_axes_px.sum()) / SECTORS
+    for _ in range(min(math.ceil(2.0 * model.sigma_px / length), 3)):
+        gap = gap | np.roll(gap, 1) | np.roll(gap, -1)
+    return np.asarray(seen & ~gap)
+
 
 # Fourier orders of the outer level that are tried. The first order is always fitted: LEDs beside the camera light one
 # side of the iris more, by a few hundredths of the step. Noise hides that from a test, but it shifts the centre.
@@ -28,30 +74,17 @@ TURNS = 4  # largest number of fits; each leaves out what the previous one could
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PixelFit:
-    """The result of a refinement.
+    """The result of a refinement."""
 
-    Attributes:
-        model: the fitted pixel model.
-        ellipse: its ellipse, rounder where nothing is seen.
-        covariance: (5, 5) of (cx, cy, a, b, angle).
-        reduced_chi2: reduced chi^2 relative to the image's noise.
-        sectors: (SECTORS,) which sectors of the outline were used.
-    """
-
-    model: EdgeModel
-    ellipse: Ellipse
-    covariance: Floats
-    reduced_chi2: float
-    sectors: Bools
+    model: EdgeModel  # the fitted pixel model
+    ellipse: Ellipse  # its ellipse, rounder where nothing is seen
+    covariance: Floats  # (5, 5) of (cx, cy, a, b, angle)
+    reduced_chi2: float  # reduced chi^2 relative to the image's noise
+    sectors: Bools  # (SECTORS,) which sectors of the outline were used
 
 
 def refine(
-    part: ImagePart,
-    start: EdgeModel,
-    sectors: Bools,
-    masked: Bools,
-    noise_dn: float,
-    scatter_px: float,
+    part: ImagePart, start: EdgeModel, sectors: Bools, masked: Bools, noise_dn: float, scatter_px: float
 ) -> PixelFit | str:
     """Fit the pixel model, or return the reason for failure.
 

@@ -55,13 +55,8 @@ def find_pupil(
 ) -> ScoredCandidate | PupilResult:
     """Return the most likely boundary of a dark or a bright pupil, or the reason why there is none.
 
-    If the middle of a dark pupil is bright, it may be an iris with a bright pupil.
-
-    Args:
-        prepared: the image.
-        shape: accepted sizes and shapes.
-        polarity: whether the pupil is darker or brighter than the iris; auto: the image decides.
-        prior: the pupil of the previous frame, which only decides where the search starts.
+    If the middle of a dark pupil is bright, it may be an iris with a bright pupil. `prior`, the pupil of the previous
+    frame, only decides where the search starts.
     """
     before = None if prior is None else prior.ellipse
     if polarity == "bright":
@@ -106,16 +101,12 @@ def continues(before: Ellipse, found: Ellipse) -> bool:
 
 @dataclass(slots=True)
 class _Outlines:
-    """What a search has found: boundaries to choose from, and outlines in pixels of the whole image.
+    """What a search has found: boundaries to choose from, and outlines in pixels of the whole image."""
 
-    Attributes:
-        choices: boundaries that may be the answer.
-        cored: outlines with a darker middle, of an iris, or of a pupil with reflections near its rim.
-        seen: outlines of which a part is seen, which may be the pupil in an iris.
-    """
-
-    choices: list[ScoredCandidate] = field(default_factory=list)
+    choices: list[ScoredCandidate] = field(default_factory=list)  # boundaries that may be the answer
+    # outlines with a darker middle, of an iris, or of a pupil with reflections near its rim
     cored: list[Ellipse] = field(default_factory=list)
+    # outlines of which a part is seen, which may be the pupil in an iris
     seen: list[Ellipse] = field(default_factory=list)
 
     def add(self, scored: ScoredCandidate, late: bool) -> bool:

@@ -18,11 +18,8 @@ def threshold_pupil(found: PupilCandidate, filled: bool) -> Ellipse | None:
     """Threshold the image around a boundary half-way between pupil and iris.
 
     Of the connected regions in the square of REACH about the boundary, the one with most pixels inside it counts. Lids
-    and reflections at the rim cut it, and lashes or shadows that touch the pupil belong to it.
-
-    Args:
-        found: the boundary.
-        filled: whether reflections that the region encloses belong to it.
+    and reflections at the rim cut it, and lashes or shadows that touch the pupil belong to it; if `filled`, reflections
+    that it encloses do, too.
 
     Returns:
         The ellipse with the region's centre of mass, its area in pixels (pi a b) and the orientation and ratio of axes

@@ -46,11 +46,7 @@ def load_eye(name_or_path: str | Path) -> EyeSpec:
 
 
 def refuse_unknown(name: str) -> None:
-    """Check that a name is one of the catalogue or that of a file.
-
-    Raises:
-        InputError: it is neither.
-    """
+    """Raise InputError if a name is neither one of the catalogue nor that of a file."""
     names = catalogue_names()
     # For a name that no file can have, os.path reports that nothing exists, while Path raises.
     if name not in names and not os.path.exists(name):

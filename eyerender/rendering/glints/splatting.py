@@ -97,8 +97,11 @@ class MirrorImages:
     ghosts: list[Image]
 
     @classmethod
-    def of(cls, job: RenderJob, mesh: SurfaceMesh | None) -> MirrorImages:
-        """Compute the images, on the host unless a mesh replaces the cornea's front."""
+    def of(cls, job: RenderJob, mesh: SurfaceMesh | None, before: MirrorImages | None = None) -> MirrorImages:
+        """Compute the images, on the host unless a mesh replaces the cornea's front.
+
+        `before` are those of a moment ago, whose quadratures are taken over.
+        """
         eye = job.eye
         scene = GlintScene.of(eye, job.film_index, job.M, job.t, job.camera, mesh, job.turned_lenses)
         lamps = (*job.lights, *sun_lamps(job.ambient, job.anchor_mm))
@@ -107,7 +110,7 @@ class MirrorImages:
         further = {order: purkinje_images(scene, eye, order, lamps, nodes) for order in sorted({*job.purkinje} - {1})}
         near = 1 in job.purkinje and job.lens.focus_mm is not None
         nearness = scene.nearness(lamps) if near else np.full((len(lamps), 2), np.nan)
-        first = scene.images(lamps, job.sensor.psf_sigma_px)
+        first = scene.images(lamps, job.sensor.psf_sigma_px, None if before is None else before.first.counts)
         # Lenses do not turn with the eye, so frames that differ in gaze only share their reflections.
         key = eye.worn, lamps, job.camera, job.anchor_mm.tobytes()
         mirrored = _KNOWN.get(key, lambda: lens_reflections(scene, eye.worn, lamps, job.anchor_mm)) if eye.worn else []

@@ -161,8 +161,16 @@ class GlintScene:
             eye=eye, lenses=lenses,
         )  # fmt: skip
 
-    def images(self, lights: Sequence[Lamp], sigma_px: float) -> LampImages:
-        """Compute the image of each lamp as finely as its size and the point-spread function require."""
+    def images(
+        self, lights: Sequence[Lamp], sigma_px: float, counts: dict[int, tuple[int, int]] | None = None
+    ) -> LampImages:
+        """Compute the image of each lamp as finely as its size and the point-spread function require.
+
+        `counts` are those of a moment ago, if there is one.
+        """
+        if counts is not None:
+            fine = {k: quadrature(*count).join(rim(_ON_RIM)) for k, count in counts.items()}
+            return LampImages(self._images_at(lights, [fine.get(k, POINT) for k in range(len(lights))]), counts)
         images = self._images_of(_roughly(*lights))
         wide = [k for k, lamp in enumerate(lights) if lamp.radius_mm > 0]
         rims = ((images[k].xy_px[-_ON_RIM:], images[k].there[-_ON_RIM:]) for k in wide)

@@ -219,7 +219,7 @@ class FrameBuilder:
         host = None
         if expected is not None and expected.job is job and expected.host is not None:
             host = expected.host.result()
-        surroundings = self._pose_surroundings(job, None if host is None else host.posed)
+        surroundings = self._pose_surroundings(job, job.posed if host is None else host.posed)
         return host or HostData(job, surroundings.posed), surroundings
 
     def _pose_surroundings(self, job: RenderJob, known: RegionMesh | None) -> Background | RegionScene:

@@ -18,7 +18,7 @@ from ...eye.model import EyeModel
 from ...eye.worn import WornLens, choices
 from ...optics.media import TEARS
 from ...optics.surfaces import Surface
-from ...optics.surfaces_biconic import Biconic
+from ...optics.surfaces_graph import Biconic
 from ...optics.surfaces_measured import Measured
 from ...optics.surfaces_quadric import Quadric
 from ...optics.transforms import rotated
@@ -26,6 +26,7 @@ from ...region.anatomy import Region
 from ...region.globe import Globe
 from ...region.limbus import upwards
 from ...region.look import Look
+from ...region.mesh import RegionMesh
 from ...region.texture import film_ripples
 from ...rig.camera import PinholeCamera, Window
 from ...rig.distortion import ray_polynomials
@@ -80,6 +81,7 @@ class RenderJob(ArrayValue):
         apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
             a turn about a point 13.5 mm behind the apex.
         region: the eye region; None for the bare eye.
+        posed: the region's mesh, where moments of an exposure share it; None: that of this pose.
         lens: focus and vignetting.
         ambient: light other than that of the lamps.
         focus_dpt: vergence (D) of the point in focus, 1 / its distance in metres.
@@ -102,6 +104,7 @@ class RenderJob(ArrayValue):
     purkinje: tuple[int, ...] = (1,)
     apex_mm: Floats | None = None
     region: Region | None = None
+    posed: RegionMesh | None = None
     lens: Lens = _LENS
     ambient: Ambient = _AMBIENT
     focus_dpt: float = 0.0
@@ -279,11 +282,14 @@ class SubFrames(ArrayValue):
     Attributes:
         jobs: the jobs, whose pictures have equal weights.
         rows: (height,) share of the whole exposure of each row of the window; None: all of it.
+        moving: part (x0, y0, width, height) of the sensor beyond which all moments have the same picture under the same
+            lamps; None: they differ everywhere.
         labelled: (height,) rows whose raster labels the first job gives; None: none.
     """
 
     jobs: tuple[RenderJob, ...]
     rows: Floats | None = None
+    moving: Window | None = None
     labelled: Bools | None = None
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from ...base.arrays import Bools, Floats, Ints
+from ...base.arrays import Bools, Floats, Ints, take_rows
 from .habits import Habits
 from .saccades import acceleration_share, duration_s, fallen_gain, oscillation_mm, progress
 from .spec import Aiming, GazeModel, GazeTable
@@ -21,6 +21,7 @@ from .spec import Aiming, GazeModel, GazeTable
 STEP_S, BEFORE_S = 1e-3, 0.5
 """Step of the grid, and how long before and after a sequence it reaches."""
 _KNOTS_S = 0.05  # between the times at which a moving eye is aimed
+_KINK_RAD = 1e-5  # change of the torsion's step from one grid point to the next
 _CORRELATED_S = 0.02  # of the velocity of drift
 _MICRO_DEG = (0.1, 0.3, 1.0)  # least, median and largest microsaccade
 _AWAY_S = 0.15  # from the beginning of a fixation to its first microsaccade
@@ -58,7 +59,8 @@ def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aiming
     target = np.full((n, 3), np.nan)
     if table.target_mm is not None:
         target = table.at("target_mm", times_s)
-        both = _aimed_at(target, head_mm, times_s, aim)
+        torsion = np.radians(table.at("torsion_deg", times_s))
+        both = _aimed_at(_Wanted(target, head_mm, torsion), times_s, aim)
     else:
         angles = np.radians(np.stack([table.at("azimuth_deg", times_s), table.at("elevation_deg", times_s)], axis=-1))
         both = np.stack([angles, angles], axis=1)
@@ -97,9 +99,10 @@ def model_course(
     target = fixations.target_mm[number] + since[:, None] * fixations.velocity_mm_s[number]
     if looking.carried is not None:
         target = looking.carried(target)
-    moving = bool(np.ptp(head_mm, axis=0).any() or fixations.pursued.any() or looking.carried is not None)
+    wish = _Wanted(target, head_mm, np.radians(model.torsion_at(times_s)))
+    still = not (np.ptp(head_mm, axis=0).any() or np.ptp(wish.torsion_rad) or fixations.pursued.any())
     small, in_small = _microsaccades(model, times_s, fixations, habits, rng)
-    wanted = _aimed_at(target, head_mm, times_s, aim, None if moving else number)
+    wanted = _aimed_at(wish, times_s, aim, number if still and looking.carried is None else None)
     wanted = wanted + _drift(model, number, habits, rng) + small[:, None]
     whole, ends_s, sizes = _with_saccades(wanted, number, times_s, fixations, habits)
     in_saccade = times_s < ends_s[number]
@@ -153,27 +156,41 @@ def _without_repeats(size: int, count: int, rng: np.random.Generator) -> Ints:
     return np.asarray(np.cumsum(steps) % size)
 
 
-def _aimed_at(target_mm: Floats, head_mm: Floats, times_s: Floats, aim: Aiming, number: Ints | None = None) -> Floats:
-    """Return the angles (n, 2 eyes, 2) of eyes that look at targets (n, 3) with the head at (n, 3).
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What eyes look at (n, 3) mm, with the head at (n, 3) mm and a torsion (n,) rad beyond Listing's."""
 
-    With `number` (n,), targets stand still, and each number is aimed at once; else the eyes are aimed every 50 ms.
+    target_mm: Floats
+    head_mm: Floats
+    torsion_rad: Floats
+
+
+def _aimed_at(wanted: _Wanted, times_s: Floats, aim: Aiming, number: Ints | None = None) -> Floats:
+    """Return the angles (n, 2 eyes, 2) rad of eyes.
+
+    With `number` (n,), everything stands still, and each number is aimed at once. Otherwise the eyes are aimed every 50
+    ms, and where targets jump or the torsion changes its course.
     """
     if number is not None:
         _, first, back = np.unique(number, return_index=True, return_inverse=True)
-        return np.stack([np.stack(aim(target_mm[first], head_mm[first], eye), axis=-1)[back] for eye in (0, 1)], axis=1)
-    knots = np.unique(np.concatenate([np.arange(0, len(times_s), max(1, round(_KNOTS_S / STEP_S))), _jumps(target_mm),
-                                      [len(times_s) - 1]]))  # fmt: skip
-    out = []
-    for eye in (0, 1):
-        angles = np.stack(aim(target_mm[knots], head_mm[knots], eye), axis=-1)
-        out.append(np.stack([np.interp(times_s, times_s[knots], column) for column in angles.T], axis=-1))
-    return np.stack(out, axis=1)
+        return _angles(take_rows(wanted, first), aim)[back]
+    every = np.arange(0, len(times_s), max(1, round(_KNOTS_S / STEP_S)))
+    knots = np.unique(np.concatenate([every, _jumps(wanted), [len(times_s) - 1]]))
+    angles = _angles(take_rows(wanted, knots), aim).reshape(len(knots), 4)
+    return np.stack([np.interp(times_s, times_s[knots], column) for column in angles.T], axis=-1).reshape(-1, 2, 2)
 
 
-def _jumps(target_mm: Floats) -> Ints:
-    """Return the grid points before and after targets that jump."""
-    jump = np.flatnonzero(np.linalg.norm(np.diff(target_mm, axis=0), axis=1) > 1.0)
-    return np.concatenate([jump, jump + 1])
+def _angles(wanted: _Wanted, aim: Aiming) -> Floats:
+    """Aim both eyes: (k, 2 eyes, 2) rad."""
+    both = [np.stack(aim(wanted.target_mm, wanted.head_mm, wanted.torsion_rad, eye), axis=-1) for eye in (0, 1)]
+    return np.stack(both, axis=1)
+
+
+def _jumps(wanted: _Wanted) -> Ints:
+    """Return the grid points before and after targets that jump, and around kinks of the torsion."""
+    jump = np.flatnonzero(np.linalg.norm(np.diff(wanted.target_mm, axis=0), axis=1) > 1.0)
+    kink = np.flatnonzero(np.abs(np.diff(wanted.torsion_rad, n=2)) > _KINK_RAD)
+    return np.concatenate([jump, jump + 1, kink, kink + 1, kink + 2])
 
 
 def _with_saccades(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -18,8 +18,9 @@ from .files import MAX_ROWS, read_columns, read_times
 Closure = Annotated[float, Field(ge=0, le=1)]
 Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=MAX_ROWS)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
-Aiming = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
-"""Turns an eye (0 right, 1 left) towards targets (k, 3) mm with the head at (k, 3) mm: azimuth and elevation, rad."""
+Aiming = Callable[[Floats, Floats, Floats, int], tuple[Floats, Floats]]
+"""Turns an eye (0 right, 1 left) with a torsion (k,) rad beyond Listing's towards targets (k, 3) mm with the head at
+(k, 3) mm: azimuth and elevation, rad."""
 
 
 def _source(value: Any) -> str:
@@ -142,7 +143,7 @@ class GazeModel(Spec):
     field_deg: tuple[Annotated[float, Field(ge=0, le=60)], Annotated[float, Field(ge=0, le=45)]] = Field(
         default=(15.0, 10.0), description="half-widths of the field of drawn targets, horizontal and vertical (chosen)"
     )
-    distance_mm: Positive = Field(default=600.0, description="distance of drawn targets")
+    distance_mm: Annotated[float, Field(ge=20)] = Field(default=600.0, description="distance of drawn targets")
     frame: Literal["world", "rig"] = Field(
         default="world", description="what the targets belong to: a headset's display moves with its cameras"
     )
@@ -356,11 +357,11 @@ class Timestamps(Spec):
         return _Drawn(standard, uniform)
 
 
-class _Drawn:
-    """Standard normal and uniform numbers of frames."""
+class _Drawn(NamedTuple):
+    """Standard normal and uniform numbers of frames (n,)."""
 
-    def __init__(self, standard: Floats, uniform: Floats) -> None:
-        self.standard, self.uniform = standard, uniform
+    standard: Floats
+    uniform: Floats
 
 
 _File = Annotated[TraceFile, Tag("[file]")]

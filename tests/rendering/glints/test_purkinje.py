@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import eyerender as er
 from eyerender.base.errors import InputError
+from eyerender.imaging.capture import render_windows
+from eyerender.imaging.labels import image_labels
 from eyerender.optics.purkinje import purkinje_path, purkinje_points
 from eyerender.optics.shooting import ray_tube
 from eyerender.optics.surfaces import components
@@ -97,3 +100,25 @@ def test_an_eye_without_the_surface_is_refused(renderer):
     rig = remote_rig()
     with pytest.raises(InputError, match="E2 has no Purkinje image 4"):
         renderer.render(job_of(eye_of("E2"), rig, (0, 0, 16, 16), purkinje=(1, 4)), spp=1)
+
+
+def test_a_scene_shows_further_images_where_its_records_say(renderer):
+    # Two pictures differ by the images 2 to 4 alone; each record has their places, and its glints stay as they are.
+    base = er.load_scene("headset", eye="E4")
+    scenes = [base.with_({"image.purkinje": orders, "sensor.noise": False}) for orders in ([], [2, 3, 4])]
+    plain, shown = (next(render_windows(s.frames().take([4]), renderer=renderer)) for s in scenes)
+    truths = [er.trace(s.frames().take([4])) for s in scenes]
+    assert truths[0].purkinje is None
+    assert truths[0].glints == truths[1].glints
+    labels = [image_labels(image, truth)["glints"] for image, truth in zip((plain, shown), truths, strict=True)]
+    assert labels[0] == labels[1]
+    images = truths[1].purkinje
+    assert images is not None
+    seen = images.ok[0] & (images.order[0] != 3)
+    assert set(images.order[0, seen]) == {2, 4}
+    added = shown.irradiance.astype(float) - plain.irradiance
+    for x, y in images.xy_px[0, seen] - shown.window[:2]:
+        row, column = round(y), round(x)
+        near = added[row - 6 : row + 7, column - 6 : column + 7]
+        assert near[5:8, 5:8].mean() > 5 * np.median(near) > 0
+    assert er.trace(er.load_scene("headset", eye="E2").with_({"image.purkinje": [4]})).purkinje is None

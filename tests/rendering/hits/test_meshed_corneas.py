@@ -14,6 +14,7 @@ from eyerender.scene.shipped import load_scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.mesh_errors import mesh_errors, mesh_job
 from tests.support.mirror import mirror_points
+from tests.support.paths import BARE_HEAD_MOUNTED
 from tests.support.render_rigs import RIGS, eye_of, head_rig, job_of
 
 DEFAULT_MM = 0.1
@@ -73,9 +74,9 @@ def test_mirror_points_of_a_mesh(renderer, rig_name):
 
 
 def test_a_scene_asks_for_a_mesh():
-    scene = load_scene("head_mounted", surfaces="mesh")
+    scene = load_scene(BARE_HEAD_MOUNTED, surfaces="mesh")
     assert render_job(scene.frames(), 0).mesh_edge_mm == DEFAULT_MM
-    assert render_job(load_scene("head_mounted").frames(), 0).mesh_edge_mm is None
+    assert render_job(load_scene(BARE_HEAD_MOUNTED).frames(), 0).mesh_edge_mm is None
     for image, key in (({"mesh_edge_mm": 0.001}, "image.mesh_edge_mm"), ({"surfaces": "smooth"}, "image.surfaces")):
         with pytest.raises(InputError) as caught:
             SceneSpec.from_mapping({**scene.spec.to_mapping(), "image": image})

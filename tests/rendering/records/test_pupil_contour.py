@@ -11,6 +11,7 @@ from matplotlib.path import Path
 from eyerender.eye.catalogue import load_eye
 from eyerender.eye.parts import ContourSpec
 from eyerender.rendering.records.job import boundary_waves
+from tests.support.paths import BARE_HEAD_MOUNTED
 from tests.support.render_oracles import contour_error, outline
 from tests.support.render_rigs import PLAIN, RIGS, head_rig, job_of, remote_rig
 
@@ -135,7 +136,7 @@ def test_both_observers_have_the_margin_of_a_scene(renderer, side):
     assert contour_error(share, plain, job.window) > 0.2
 
 
-@pytest.mark.parametrize("rig_name", ["blignaut2014", "head_mounted"])
+@pytest.mark.parametrize("rig_name", ["blignaut2014", BARE_HEAD_MOUNTED])
 @pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_the_ellipse_of_the_picture_is_that_of_the_analytic_observer(renderer, rig_name, seed):
     import cv2

@@ -13,7 +13,7 @@ from eyerender.region.anatomy import Brow, Lashes, Region, Skin
 from eyerender.region.contour import COLUMNS
 from eyerender.region.lids import ROWS
 from eyerender.region.skin import sheet_v
-from tests.optics.test_diffusion import edge
+from tests.optics.test_interface import edge
 from tests.support import render_rigs as rigs
 
 pytestmark = pytest.mark.render

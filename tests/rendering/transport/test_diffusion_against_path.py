@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eyerender.optics import diffusion
-from tests.optics.test_diffusion import edge
+from tests.optics.test_interface import edge
 
 pytestmark = pytest.mark.render
 
