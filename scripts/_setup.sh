@@ -30,7 +30,7 @@ fingerprint() {
       cat "$root/pyproject.toml" "$root/constraints.txt"; } | checksum
 }
 
-# There are five set-ups: run, live (the extra `live` too), test (`test`), all (`test`, `ray` and `fuzz`), and docs, which has an
+# There are five set-ups: run, live (the extra `live` too), test (`test`), all (`test`, `ray`, `fuzz` and `oracles`), and docs, which has an
 # environment of its own. Each leaves the stamps of those that it holds.
 is_set_up() {
     [ -x "$venv/bin/python" ] && [ -f "$venv/.stamp-$1" ] && [ "$(cat "$venv/.stamp-$1")" = "$(fingerprint)" ]
@@ -139,7 +139,7 @@ set_up() {
     began=$(date +%s)
     make_venv
     case $1 in
-        all) parts="test ray fuzz" stamps="all test run" size="1.6 GB" ;;
+        all) parts="test ray fuzz oracles" stamps="all test run" size="2.1 GB" ;;
         test) parts=test stamps="test run" size="1.3 GB" ;;
         live) parts=live stamps="live run" size="1 GB" ;;
         docs) parts=docs stamps="docs run" size="1 GB" ;;

@@ -46,10 +46,12 @@ CLEAR_PX = 5.0
 
 @dataclass(frozen=True)
 class Measured:
-    """Scatter per axis, stated noise and noise of the sensor alone (px) of the pupil's centre and of the glints."""
+    """Scatter per axis, stated noise and bound (px) of the pupil's centre, and stated noise over scatter of glints."""
 
-    centre: tuple[float, float, float]
-    glints: list[tuple[float, float, float]]
+    scatter: float
+    stated: float
+    bound: float
+    glints: list[float]
     found: float
 
 
@@ -106,14 +108,14 @@ def measured(scene: er.Scene, frame: int, draws: int) -> Measured:
     ]
     seen, exact, alone = er.ImageObserver(backend="llvm").observe_images(exposed), er.trace(frames), sensor_noise(scene)
     stated, points = extracted_noise(scene), exact.pupil.points_px[0]
-    centre, plain = (centre_bound(points, float(noise.outline_px[0])) for noise in (stated, alone))
+    centre, least = (centre_bound(points, float(noise.outline_px[0])) for noise in (stated, alone))
     glints = []
     for k in range(len(scene.rig.lights)):
         there = seen.glints.ok & (seen.glints.light == k)
         if there.any(axis=1).mean() > 0.9:
-            found = scatter(seen.glints.xy_px[there])
-            glints.append((found, float(stated.glint_px[0, k]), float(alone.glint_px[0, k])))
-    return Measured((scatter(seen.pupil.centre_px[seen.pupil.ok]), centre, plain), glints, float(seen.pupil.ok.mean()))
+            glints.append(float(stated.glint_px[0, k]) / scatter(seen.glints.xy_px[there]))
+    found = seen.pupil.ok
+    return Measured(scatter(seen.pupil.centre_px[found]), centre, least, glints, float(found.mean()))
 
 
 def main() -> int:
@@ -130,14 +132,13 @@ def main() -> int:
                 scene = scene_of(name, subject, seed, disc, speed)
                 found = measured(scene, clear_frame(scene, subject), draws)
                 what = f"{kind}, {name} {subject}, {disc:g} px, {speed:g} deg/s"
-                actual, stated, alone = found.centre
                 report.add(row(f"{what}: found", found.found, "share"))
-                report.add(row(f"{what}: scatter of the centre", actual, "px"))
-                report.add(row(f"{what}: bound of the centre", alone, "px"))
-                report.add(row(f"{what}: centre, stated over scatter", stated / actual, "ratio"))
-                centres.append(stated / actual)
+                report.add(row(f"{what}: scatter of the centre", found.scatter, "px"))
+                report.add(row(f"{what}: bound of the centre", found.bound, "px"))
+                centres.append(found.stated / found.scatter)
+                report.add(row(f"{what}: centre, stated over scatter", centres[-1], "ratio"))
                 if found.glints:
-                    glints.append(float(np.median([s / a for a, s, _ in found.glints])))
+                    glints.append(float(np.median(found.glints)))
                     report.add(row(f"{what}: glints, stated over scatter, median", glints[-1], "ratio"))
         must = BAR if kind == "checked" and not options.quick else None
         for what, ratios in (("centre", np.array(centres)), ("glints", np.array(glints))):

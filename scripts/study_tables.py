@@ -75,6 +75,15 @@ def people_of(folder: Path) -> dict[str, Any]:
     return {summary["study"]: {**kept, "findings": own if summary["study"] not in KNOWN else []}}
 
 
+def joined(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace the tables of a study; rows of observers that the new run does not have stay."""
+    seen = {row.get("observer") for rows in new.values() for row in rows}
+    kept = {name: [row for row in rows if row.get("observer") and row["observer"] not in seen]
+            for name, rows in old.items()}  # fmt: skip
+    names = [name for name in new if new[name] or name not in old]
+    return {**old, **{name: [*new[name], *kept.get(name, [])] for name in names}}
+
+
 def people_tables(data: Mapping[str, Any]) -> dict[str, str]:
     """Return every table over people by the name of its study and its own."""
     out = {}
@@ -98,14 +107,18 @@ def people_tables(data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _calibrations(rows: list[dict[str, Any]]) -> str:
-    """Format the errors of calibrations: a column for each number of targets."""
-    by: dict[tuple[str, ...], dict[str, str]] = {}
+    """Format the errors of calibrations: a column per number of targets; fewer people than elsewhere are stated."""
+    by: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
     for row in rows:
         rig, *estimator, targets, when = row["condition"].split(", ")
-        key = rig, ", ".join(estimator), when, str(row["people"])
-        by.setdefault(key, {})[targets] = _cell(row, _MEAN)
+        by.setdefault((rig, ", ".join(estimator), when), {})[targets] = row
     targets = list(dict.fromkeys(one for cells in by.values() for one in cells))
-    body = [[*key, *(cells.get(one, "-") for one in targets)] for key, cells in sorted(by.items())]
+    body = []
+    for key, cells in sorted(by.items()):
+        most = max(row["people"] for row in cells.values())
+        texts = {one: _cell(row, _MEAN) + (f", {row['people']} people" if row["people"] < most else "")
+                 for one, row in cells.items()}  # fmt: skip
+        body.append([*key, str(most), *(texts.get(one, "-") for one in targets)])
     return table(["rig", "estimator", "", "people", *targets], body)
 
 
@@ -255,7 +268,8 @@ def main() -> int:
     people = json.loads(PEOPLE_DATA.read_text(encoding="utf-8")) if PEOPLE_DATA.exists() else {}
     for folder in map(Path, sys.argv[1:]):
         if over_people := people_of(folder):
-            people |= over_people
+            for name, new in over_people.items():
+                people[name] = joined(people.get(name, {}), new)
             continue
         for name, new in numbers_of(folder).items():
             old = data.get(name, {})

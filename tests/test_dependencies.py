@@ -59,7 +59,7 @@ def test_what_is_imported_is_declared_and_the_other_way_about():
         [
             r
             for name, some in project["optional-dependencies"].items()
-            if name not in ("test", "fuzz", "docs")
+            if name not in ("test", "oracles", "fuzz", "docs")
             for r in some
         ]
     )

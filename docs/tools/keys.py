@@ -370,8 +370,8 @@ def pages() -> dict[str, str]:
             if record not in described:
                 described[record] = page_of(places, kind)
                 made[described[record]] += section(record, places)
-    made["keys_eye"] += sources_of_eyes()
-    return {page: linked(text, page, described) for page, text in made.items()}
+    linked_pages = {page: linked(text, page, described) for page, text in made.items()}
+    return {**linked_pages, "eye_sources": sources_of_eyes()}
 
 
 def toctree(names: Iterable[str]) -> str:
@@ -385,6 +385,8 @@ def head(block: Block) -> str:
     if "" in block.paths:
         text += f"{INTRODUCTION}\n\n`eyerender schema {block.kind}` prints the same as a JSON Schema for editors.\n\n"
         parts = {page: one.title for page, one in BLOCKS.items() if one.kind == block.kind and one != block}
+        if block.kind == "eye":
+            parts["eye_sources"] = "Sources of the shipped eyes"
         if parts:
             text += "Pages of their own:\n\n" + "".join(f"- [{its}]({page}.md)\n" for page, its in parts.items())
             text += toctree(parts) + "\n"
@@ -405,10 +407,10 @@ def linked(text: str, page: str, described: dict[type[Spec], str]) -> str:
 
 def sources_of_eyes() -> str:
     """The sources of the values of the shipped eyes, as their files state them."""
-    lines = ["## Sources of the shipped eyes", ""]
+    lines = ["# Sources of the shipped eyes", ""]
     for name in catalogue_names():
         eye = load_eye(name)
-        lines += [f"### {name}", "", eye.description, "", "| keys | source |", "|---|---|"]
+        lines += [f"## {name}", "", eye.description, "", "| keys | source |", "|---|---|"]
         lines += [f"| `{key}` | {cell(text)} |" for key, text in eye.sources.items()]
         lines.append("")
     return "\n".join(lines)

@@ -10,6 +10,7 @@ beginning.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -101,8 +102,27 @@ class Interleaving:
         return np.asarray(at)
 
 
+class Numbers(Sequence[int], ABC):
+    """A sequence of integers that are computed, of which slices are lists."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def _at(self, place: int) -> int:
+        """Return the one at a place, counted from 0."""
+
+    @overload
+    def __getitem__(self, at: int) -> int: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[int]: ...
+    def __getitem__(self, at: int | slice) -> int | list[int]:
+        if isinstance(at, slice):
+            return [self._at(k) for k in range(*at.indices(len(self)))]
+        return self._at(range(len(self))[at])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Joined(Sequence[int]):
+class Joined(Numbers):
     """A sequence of integers: a range from 0, followed by larger numbers."""
 
     head: range
@@ -111,15 +131,8 @@ class Joined(Sequence[int]):
     def __len__(self) -> int:
         return len(self.head) + len(self.tail)
 
-    @overload
-    def __getitem__(self, at: int) -> int: ...
-    @overload
-    def __getitem__(self, at: slice) -> list[int]: ...
-    def __getitem__(self, at: int | slice) -> int | list[int]:
-        if isinstance(at, slice):
-            return [self[k] for k in range(*at.indices(len(self)))]
-        k = range(len(self))[at]
-        return self.head[k] if k < len(self.head) else int(self.tail[k - len(self.head)])
+    def _at(self, place: int) -> int:
+        return self.head[place] if place < len(self.head) else int(self.tail[place - len(self.head)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,7 +282,7 @@ class Selection:
 
 
 @dataclass(frozen=True, slots=True)
-class ClipFrames(Sequence[int]):
+class ClipFrames(Numbers):
     """The frames of clips in a row: n consecutive samples for each number of `clips`."""
 
     clips: Sequence[int]
@@ -278,14 +291,8 @@ class ClipFrames(Sequence[int]):
     def __len__(self) -> int:
         return len(self.clips) * self.n
 
-    @overload
-    def __getitem__(self, at: int) -> int: ...
-    @overload
-    def __getitem__(self, at: slice) -> list[int]: ...
-    def __getitem__(self, at: int | slice) -> int | list[int]:
-        if isinstance(at, slice):
-            return [self[k] for k in range(*at.indices(len(self)))]
-        clip, frame = divmod(range(len(self))[at], self.n)
+    def _at(self, place: int) -> int:
+        clip, frame = divmod(place, self.n)
         return self.clips[clip] * self.n + frame
 
 

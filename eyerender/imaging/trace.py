@@ -21,6 +21,7 @@ from ..base.status import Status, mark
 from ..eye.model import EyeModel
 from ..eye.pose import Poses, rigid_motion
 from ..region.contour import inner_margins
+from ..region.mesh import edge_angles
 from ..rendering.records.job import globe_of
 from ..scene import Frames, Scene
 from ..scene.observation import EYES, MAX_GLINTS, Observations
@@ -225,18 +226,7 @@ def _openings(frames: Frames, rows: Indices, margins: Floats) -> tuple[Floats, F
     centre, stop = (turn @ point + shift for point in (eye.sclera.centre_mm, eye.stop.centre_mm))
     half = _COLUMNS // 2
     upper, lower = margins[:, : half + 1], np.concatenate([margins[:, half:], margins[:, :1]], axis=1)
-    angles = [_angle(edge, centre, stop[:, 1]) for edge in (upper, lower)]
+    angles = [edge_angles(edge, centre, stop[:, 1]) for edge in (upper, lower)]
     own = np.arctan2(stop[:, 2] - centre[:, 2], stop[:, 0] - centre[:, 0])
     radius = np.sqrt(np.maximum(eye.sclera.radius_mm**2 - (stop[:, 1] - centre[:, 1]) ** 2, 0.0))
     return radius * np.maximum(angles[0] - angles[1], 0.0), radius * np.minimum(angles[0] - own, own - angles[1])
-
-
-def _angle(edge: Floats, centre: Floats, y_mm: Floats) -> Floats:
-    """Return the directions (k,) rad from centres (k, 3) to where edges (k, c, 3) pass y (k,)."""
-    along = edge if edge[0, 0, 1] < edge[0, -1, 1] else edge[:, ::-1]
-    last = np.clip((along[:, :, 1] < y_mm[:, None]).sum(axis=1), 1, along.shape[1] - 1)
-    rows = np.arange(len(edge))
-    a, b = along[rows, last - 1], along[rows, last]
-    share = np.clip((y_mm - a[:, 1]) / (b[:, 1] - a[:, 1]), 0.0, 1.0)
-    point = a + share[:, None] * (b - a) - centre
-    return np.asarray(np.arctan2(point[:, 2], point[:, 0]))

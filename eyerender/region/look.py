@@ -121,7 +121,7 @@ class Look(Spec):
     film_ripples: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
         default=None,
         description="slope of the ripples of the tear film on the sclera, which mirror lamps as rows of points; 0 for "
-        "none; default: five people in six have ripples of 0.12 to 0.28, drawn from `iris_seed` (chosen)",
+        "none; default: five people in six have ripples of 0.15 to 0.3, drawn from `iris_seed` (chosen)",
     )
     limbus_albedo: Albedo = Field(
         default=0.35,

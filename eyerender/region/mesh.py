@@ -102,14 +102,24 @@ class LidMargins(ArrayValue):
         Its centre is that of the circle in which the plane cuts the sphere, and its ends are in the directions of the
         points where the edges, straight between their landmarks, pass the plane.
         """
-        centre = globe.mirror * globe.centre
-        angles = []
-        for edge in (self.upper_margin, self.lower_margin):
-            along = edge if edge[0, 1] < edge[-1, 1] else edge[::-1]
-            x, z = (np.interp(y_mm, along[:, 1], along[:, k]) - centre[k] for k in (0, 2))
-            angles.append(np.arctan2(z, x))
-        radius = np.sqrt(max(globe.radius_mm**2 - (y_mm - centre[1]) ** 2, 0.0))
-        return float(radius * max(angles[0] - angles[1], 0.0))
+        centre, y = (globe.mirror * globe.centre)[None], np.array([y_mm])
+        upper, lower = (edge_angles(edge[None], centre, y)[0] for edge in (self.upper_margin, self.lower_margin))
+        radius = np.sqrt(max(globe.radius_mm**2 - (y_mm - centre[0, 1]) ** 2, 0.0))
+        return float(radius * max(upper - lower, 0.0))
+
+
+def edge_angles(edge: Floats, centre_mm: Floats, y_mm: Floats) -> Floats:
+    """Return the directions (k,) rad in the plane of x and z from centres (k, 3) to where edges (k, c, 3) pass y (k,).
+
+    Edges are straight between their points and held beyond their ends.
+    """
+    along = edge if edge[0, 0, 1] < edge[0, -1, 1] else edge[:, ::-1]
+    last = np.clip((along[:, :, 1] < y_mm[:, None]).sum(axis=1), 1, along.shape[1] - 1)
+    rows = np.arange(len(edge))
+    a, b = along[rows, last - 1], along[rows, last]
+    share = np.clip((y_mm - a[:, 1]) / (b[:, 1] - a[:, 1]), 0.0, 1.0)
+    point = a + share[:, None] * (b - a) - centre_mm
+    return np.asarray(np.arctan2(point[:, 2], point[:, 0]))
 
 
 def lid_margins(spec: Region, globe: Globe) -> LidMargins:

@@ -577,7 +577,7 @@ class _Strip:
         skin, rows, upper = self.spec.skin, self.rows, self.upper
         # Finer mottling than half a millimetre would show the lattice of the map as a weave.
         slow, blotch, fine = ((c, c) for c in ((0, 4), (3, 22), (25, 85)))
-        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.035, 22, *blotch), (0.025, 23, *fine))
+        mottled = self.tiles.mixed(self.places, (0.06, 21, *slow), (0.04, 22, *blotch), (0.03, 23, *fine))
         tone = (1 + skin.mottling * mottled) * open_
         tone *= 1 - skin.veins * self.veins()
         tone *= self.slowly("shade")

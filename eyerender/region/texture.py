@@ -81,7 +81,7 @@ def _blurred(layers: Floats) -> Singles:
 def film_ripples(seed: int) -> float:
     """Draw the slope of the ripples of the tear film on the sclera; one person in six has none (chosen)."""
     share, slope = np.random.default_rng((0xF11A, seed)).random(2)
-    return float(0.12 + 0.16 * slope) if share < 5 / 6 else 0.0
+    return float(0.15 + 0.15 * slope) if share < 5 / 6 else 0.0
 
 
 @lru_cache(maxsize=4)

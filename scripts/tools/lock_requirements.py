@@ -31,7 +31,7 @@ PYTHONS = ("3.11", "3.12", "3.13")
 OLDER_NAMES = {17: ["manylinux2014"], 12: ["manylinux2010"], 5: ["manylinux1"]}
 TAGS = [tag for minor in range(41, 4, -1) for tag in (f"manylinux_2_{minor}", *OLDER_NAMES.get(minor, ()))]
 PLATFORMS = [f"{tag}_x86_64" for tag in (*TAGS, "linux")]
-LEFT_OUT = {"torch", "test", "fuzz", "docs"}
+LEFT_OUT = {"torch", "test", "oracles", "fuzz", "docs"}
 HEAD = """\
 # Written by scripts/tools/lock_requirements.py from constraints.txt: wheels for CPython 3.11-3.13, Linux x86-64, glibc.
 # pip install --require-hashes -r requirements.lock

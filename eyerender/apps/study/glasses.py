@@ -2,7 +2,7 @@
 
 A person sits before a screen with a lamp at each corner, two cameras below it and a lamp at the first of them. All
 lenses sit in the same frame on the same person, so differences are paired by person. Estimators are calibrated on nine
-targets and tested on the sixteen between them.
+targets and tested on the sixteen between them, of which images show four.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ...gaze.regression import Regression
 from ...gaze.twocamera import ShihWuLiu
 from ...population.correction import fitting
 from ...rig.rig import RigGeometry
-from ...scene import Scene
+from ...scene import Frames, Scene
 from ...scene.observation import Observations
 from ...scene.spec import SceneSpec
 from .results import ModelResults, mean_row
@@ -55,6 +55,8 @@ SIDE = 5
 CENTRE = SIDE * SIDE // 2
 LEARNT = tuple(SIDE * i + j for i in (0, 2, 4) for j in (0, 2, 4))
 """Targets of the calibration; the offset is taken at the one in the middle, `CENTRE`."""
+IN_IMAGES = (*LEARNT, 6, 8, 16, 18)
+"""Targets of images: those of the calibration, and four between them."""
 POLYNOMIAL, GEOMETRIC = "polynomial R3", "Guestrin-Eizenman"
 ESTIMATORS: Mapping[str, GazeEstimator] = {
     POLYNOMIAL: Regression("R3", light=4, normalised=False),
@@ -120,8 +122,11 @@ def glasses_part(who: str, person: Mapping[str, Any], observer: str) -> ModelRes
     """Observe a person in each condition and estimate gaze, by rays or from images."""
     out, imaged = ModelResults(eye_model=who, person=person), observer != "analytic"
     scenes = worn_by(person, imaged=imaged)
-    truth = {name: trace(scene) for name, scene in scenes.items()}
-    seen = {name: _extracted(scene) for name, scene in scenes.items()} if imaged else truth
+    frames = {name: scene.frames() for name, scene in scenes.items()}
+    if imaged:
+        frames = {name: some[np.isin(some.index.fixation, IN_IMAGES)] for name, some in frames.items()}
+    truth = {name: trace(some) for name, some in frames.items()}
+    seen = {name: _extracted(some) for name, some in frames.items()} if imaged else truth
     out.more["features"] = {name: _features(seen[name], truth[name], truth[NONE]) for name in scenes}
     out.done["own", observer] = done = _estimates(seen, scenes[NONE].rig)
     keys = {"protocol": "own", "observer": observer, "eye_model": who, "eye": "right"}
@@ -132,10 +137,10 @@ def glasses_part(who: str, person: Mapping[str, Any], observer: str) -> ModelRes
     return out
 
 
-def _extracted(scene: Scene) -> Observations:
+def _extracted(frames: Frames) -> Observations:
     from ...imaging.imageobserver import ImageObserver
 
-    return ImageObserver(threads=1).observe(scene.frames())
+    return ImageObserver(threads=1).observe(frames)
 
 
 def _estimates(seen: Mapping[str, Observations], rig: RigGeometry) -> dict[tuple[str, str, str], EstimatorErrors]:

@@ -24,6 +24,14 @@ _LEAST = 2  # people of an interval
 _UNKNOWN = "The abstract names neither the calibration nor the estimator"
 _POWERED = ("-6 D", "-3 D", "+3 D", "+6 D")
 _WORDS = {True: "right", False: "wrong", None: "not comparable"}
+_WHY = {
+    "L1": "A lens magnifies pupil and glints alike, and glints scale them back.",
+    "L2": "A lens magnifies pupil and glints alike, and glints scale them back.",
+    "L3": "A sphere magnifies an eye as a whole, and the eye looks through the lens through which it is seen. A "
+    "cylinder magnifies one meridian only, which no model of an eye expects.",
+    "L4": "Lenses of high power show more reflections near the pupil, so glints are lost to these, too.",
+}
+"""Why a finding may be wrong here."""
 _TICKS = {"cylinder -2 D": "cyl.", "-3 D, tilted": "tilted", g.CUT: "IR cut"}
 _FEATURES = {
     "turn of the eye": "rotation", "size of the pupil": "pupil_size", "pupil moves (px)": "pupil_px",
@@ -87,7 +95,7 @@ class GlassesStudy(Study):
     about = (
         "Each person wears every pair of glasses in the same frame before one rig: a screen with a lamp at each "
         "corner, and two cameras with a lamp below it; images are those of the first camera. Eyes accommodate by 1.5 D "
-        "in all conditions. Estimators are calibrated on nine targets and tested on sixteen others.",
+        "in all conditions. Estimators are calibrated on nine targets and tested on sixteen others, or four in images.",
         "'Without glasses' is the calibration of the bare eye, 'same glasses' one of each pair, and 'one offset' moves "
         "the first by the error at the middle target. A frame is lost if there is no estimate. Blurred sight and heads "
         "that turn are not simulated.",
@@ -147,13 +155,13 @@ class GlassesStudy(Study):
         features = [row for people in _observed(parts) for row in _features(people)]
         verdicts = [_verdict(finding) for finding in self.findings(parts)]
         columns = {"finding": "finding", "source": "source", "observer": "observer", "estimator": "estimator",
-                   "verdict": "verdict", "values": "detail"}  # fmt: skip
+                   "verdict": "verdict", "values": "detail", "explanation": "why"}  # fmt: skip
         caption = "Rises of the error and of lost frames"
         return [
             Section("Errors", *drawn, table_of(effects, _EFFECTS, caption, folded=True)),
             Section("Features", _ABOUT_FEATURES, table_of(features, {"observer": "observer", "glasses": "condition",
                     **_FEATURES})),
-            Section("Published findings", _ABOUT_VERDICTS, table_of(verdicts, columns, wide=(0, 5))),
+            Section("Published findings", _ABOUT_VERDICTS, table_of(verdicts, columns, wide=(0, 5, 6))),
         ]  # fmt: skip
 
     def text(self, summary: Mapping[str, Any]) -> list[str]:
@@ -261,4 +269,5 @@ def _verdict(finding: Finding) -> dict[str, Any]:
     return {
         "id": finding.id, "finding": rule, "source": finding.sentence, "observer": finding.observer,
         "estimator": estimator, "verdict": _WORDS[finding.verdict], "detail": finding.detail,
+        "why": _WHY.get(finding.id) if finding.verdict is False else None,
     }  # fmt: skip

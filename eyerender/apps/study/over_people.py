@@ -46,7 +46,7 @@ def people_rows(groups: Mapping[str, Groups], measured: Mapping[str, Experiment]
 
     Args:
         groups: name of a person -> errors.
-        measured: condition, or its end after a comma or blank -> what the experiment found.
+        measured: end of a condition, after the last comma or `on` -> what the experiment found.
     """
     by: dict[tuple[str, str, str], dict[str, Floats]] = {}
     for who, found in groups.items():
@@ -61,13 +61,11 @@ def people_rows(groups: Mapping[str, Groups], measured: Mapping[str, Experiment]
         every = list(of.values())
         if len({len(one) for one in every}) == 1 and len(every[0]) > 1:
             row |= {key: users_of(np.stack(every))[key] for key in ("U50E95", "U95E95")}
-        exact = by.get((protocol, "analytic", name), {})
-        if observer != "analytic" and (both := [who for who in means if known_mean(exact.get(who, np.zeros(0)))]):
-            added = np.array([means[who] - (known_mean(exact[who]) or 0.0) for who in both])
-            row |= {f"added_{key}": value for key, value in summary(added).items() if key[0] != "p"}
-        told = measured.get(
-            name.rpartition(" ")[2] if name.rpartition(", ")[2] not in measured else name.rpartition(", ")[2]
-        )
+        exact = {who: known_mean(one) for who, one in by.get((protocol, "analytic", name), {}).items()}
+        added = [mean - start for who, mean in means.items() if (start := exact.get(who)) is not None]
+        if observer != "analytic" and added:
+            row |= {f"added_{key}": value for key, value in summary(np.array(added)).items() if key[0] != "p"}
+        told = measured.get(name.rpartition(", ")[2].rpartition(" on ")[2])
         if told is not None:
             row |= {"measured_deg": told.mean_deg, "measured_low_deg": told.low_deg, "measured_high_deg": told.high_deg}
             if told.low_deg is not None and told.high_deg is not None:
@@ -111,6 +109,9 @@ def line_of(row: Mapping[str, Any]) -> str:
 
 def differs(id: str, key: tuple[str, str], rule: str, values: Floats, expected: str) -> Finding:
     """Test that the mean of paired differences (p,) of people is positive: the lower end of its interval is > 0."""
+    values = values[np.isfinite(values)]
+    if len(values) < 2:
+        return Finding(id, *key, rule, None, "> 0", None, "fewer than two people", expected)
     mean, low, high = mean_interval(values)
     detail = f"{len(values)} people, mean {mean:.4f}, 95 % interval {low:.4f} to {high:.4f}"
     return Finding.of(id, key, f"{rule}: lower end of the 95 % interval", low, "> 0", detail, expected)

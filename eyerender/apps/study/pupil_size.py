@@ -295,7 +295,7 @@ def straight_rows(parts: Sequence[ModelResults]) -> list[dict[str, Any]]:
     rows = []
     for camera, mm in people[0]["straight"] if len(people) > 3 else ():
         sizes = np.stack([one["sizes"]["analytic", camera, mm]["root of area"] for one in people])
-        lost = sizes / sizes[:, :1] - 1.0
+        lost = np.nan_to_num(sizes / sizes[:, :1] - 1.0)
         strength = 100.0 * lost @ lost.mean(axis=0) / np.sum(lost.mean(axis=0) ** 2)
         fit = linregress([one["refraction_d"] for one in people], strength)
         half = float(student.ppf(0.975, len(people) - 2) * fit.stderr)
@@ -312,15 +312,15 @@ def artefact_rows(parts: Sequence[ModelResults]) -> list[dict[str, Any]]:
     rows = []
     for camera in people[0] if len(people) > 1 else ():
         moved = {cause: np.stack([one[camera][cause] for one in people]) for cause in CAUSES}
-        pattern = {c: (d - d.mean(axis=3, keepdims=True))[:, 0] - (d - d.mean(axis=3, keepdims=True))[:, -1]
-                   for c, d in moved.items()}  # fmt: skip
+        change = {cause: every[:, 0] - every[:, -1] for cause, every in moved.items()}
+        pattern = {cause: d - np.nanmean(d, axis=2, keepdims=True) for cause, d in change.items()}
         for cause, every in moved.items():
-            shifts = every.mean(axis=3)  # people, luminances, eyes, 2
+            shifts = np.nanmean(every, axis=3)  # people, luminances, eyes, 2
             shift = shifts[:, 0] - shifts[:, -1]
             size = np.linalg.norm(shift, axis=2)
             ways = shift / size[..., None] * [[-1.0, 1.0], [1.0, 1.0]]  # nasal is to the left of the right eye
             vergence = shift[:, 0, 0] - shift[:, 1, 0]
-            squares = np.stack([np.sum(pattern[one] ** 2, axis=(1, 2, 3)) for one in (cause, "whole")], axis=1)
+            squares = np.stack([np.nansum(pattern[one] ** 2, axis=(1, 2, 3)) for one in (cause, "whole")], axis=1)
             low, high = resampled(squares, _share)
             lit = np.linalg.norm(shifts, axis=3).mean(axis=(0, 2)).tolist()
             rows.append({
@@ -330,7 +330,7 @@ def artefact_rows(parts: Sequence[ModelResults]) -> list[dict[str, Any]]:
                 **interval(vergence, "vergence"), "vergence_sd": float(vergence.std(ddof=1)),
                 "nasal": float(np.mean(ways[..., 0] > 0)),
                 "concentration": float(np.linalg.norm(ways.mean(axis=(0, 1)))),
-                "pattern_deg": float(np.sqrt(np.mean(np.sum(pattern[cause] ** 2, axis=3)))),
+                "pattern_deg": float(np.sqrt(np.nanmean(np.sum(pattern[cause] ** 2, axis=3)))),
                 "share": _share(squares), "share_low": low, "share_high": high,
             })  # fmt: skip
     return rows

@@ -11,7 +11,7 @@ _ROUGH_OIL, _THINNER = 0.13, 0.35  # roughness of a film of oil at a gloss of 0.
 # roughness grows by `_BARER` per gloss below that of standing water.
 _ROUGH_WET, _STANDING, _BARER, _ROUGHEST = 0.02, 0.97, 3.2, 0.15
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
-_RIPPLE_MM, _GLOBE_MM, _ROUGH_RIPPLES = 1.4, 12.0, 0.012  # of a rippled film: waves, the globe's radius, roughness
+_RIPPLE_MM, _GLOBE_MM, _ROUGH_RIPPLES = 1.3, 12.0, 0.012  # of a rippled film: waves, the globe's radius, roughness
 _CALM_MM = (5.6, 7.2)  # distance from the optic axis over which the smooth film of the cornea gets its ripples
 _RIPPLES = ((0.05, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 
@@ -76,7 +76,7 @@ def rippled_film(normal: mi.Vector3f, slope: mi.Float, pixel_mm: mi.Float) -> tu
     blur = slope * wave * pixel_mm * 0.29  # standard deviation over a pixel is its width / sqrt(12)
     smooth = dr.minimum(dr.sqrt(_ROUGH_RIPPLES * _ROUGH_RIPPLES + blur * blur), _ROUGHEST)
     patch = dr.sin(0.53 * p0 + 2 * dr.sin(0.29 * q0)) * dr.sin(0.46 * q0 + 2 * dr.sin(0.36 * p0))
-    rough = dr.lerp(_ROUGHEST, smooth, dr.clip(3 * patch + 0.4, 0, 1))
+    rough = dr.lerp(_ROUGHEST, smooth, dr.clip(3 * patch + 0.8, 0, 1))
     gloss = _STANDING - (rough - _ROUGH_WET) * (1 / _BARER)
     off = _GLOBE_MM * dr.sqrt(normal.y * normal.y + normal.z * normal.z)
     slope = slope * dr.clip((off - _CALM_MM[0]) / (_CALM_MM[1] - _CALM_MM[0]), 0, 1)
