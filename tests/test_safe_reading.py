@@ -46,7 +46,7 @@ EXCEPTIONS = {
     "apps.benchmark.worker.main: os.fdopen": "pipes of this process",
     "apps.benchmark.separate.main: os.fdopen": "pipes of this process",
     "apps.benchmark.separate.eight_bits: Image.open": "in another environment, an image that was checked here",
-    "apps.realism.patches._equalised: Image.open": "bytes that were just encoded",
+    "apps.realism.separability._equalised: Image.open": "bytes that were just encoded",
     "dataset.training.augment.Augmentation._recorded: Image.open": "bytes that were just encoded",
     "apps.study.literature.texts: (Path(__file__).with_name('texts') / f'{name}.csv').open": "a file of this package",
     "folders.imagefile.compressed: Image.open": "bytes that were just encoded",
