@@ -239,7 +239,7 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 99950,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 99960,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1160,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 19340,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 970,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
