@@ -252,7 +252,9 @@ def _findings(people: _People) -> list[Finding]:
     excess = Effect.of(geometric - polynomial)
     rule = f"{g.GEOMETRIC}: calibrated with the same glasses, it rises by more than that of the polynomial (deg)"
     found = Finding.of("K2", key, rule, excess.low, "> 0", f"{excess}; rise {Effect.of(geometric)}", KUEBLER)
-    return [one if np.isfinite(one.value) else replace(one, verdict=None) for one in (*out, found)]  # too few people
+    # Too few people give no verdict.
+    known = [one.value is not None and np.isfinite(one.value) for one in (*out, found)]
+    return [one if k else replace(one, verdict=None) for one, k in zip((*out, found), known, strict=True)]
 
 
 def _in_all(name: str, people: _People, rule: str, by: Mapping[str, Floats]) -> Finding:
