@@ -70,6 +70,7 @@ def test_an_offset_is_the_error_at_the_middle_target(part):
         assert not np.array_equal(moved, 0.0 * moved)
 
 
+@pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value")  # the means of nobody
 def test_verdicts():
     """A sign counts only where the interval excludes 0, and with every calibration."""
     people = _People([], "analytic")
@@ -82,6 +83,8 @@ def test_verdicts():
     ):
         by = dict(zip(g.CALIBRATIONS, found, strict=True))
         assert _in_all("L1", people, "x: up", by).verdict is verdict
+    nobody = glasses_study._findings(people)
+    assert {one.verdict for one in nobody} == {None}
     assert Effect.of(up).mean == pytest.approx(1.0)
     assert Effect.of(few).n == 1
 

@@ -29,7 +29,7 @@ _WHY = {
     "L2": "A lens magnifies pupil and glints alike, and glints scale them back.",
     "L3": "A sphere magnifies an eye as a whole, and the eye looks through the lens through which it is seen. A "
     "cylinder magnifies one meridian only, which no model of an eye expects.",
-    "L4": "Lenses of high power show more reflections near the pupil, so glints are lost to these, too.",
+    "L4": "Behind +6 D, most glints are not found: they stand a sixth farther apart, among reflections of the lens.",
 }
 """Why a finding may be wrong here."""
 _TICKS = {"cylinder -2 D": "cyl.", "-3 D, tilted": "tilted", g.CUT: "IR cut"}
@@ -251,7 +251,9 @@ def _findings(people: _People) -> list[Finding]:
     excess = Effect.of(geometric - polynomial)
     rule = f"{g.GEOMETRIC}: calibrated with the same glasses, it rises by more than that of the polynomial (deg)"
     found = Finding.of("K2", key, rule, excess.low, "> 0", f"{excess}; rise {Effect.of(geometric)}", KUEBLER)
-    return [*out, found]
+    # Too few people give no verdict.
+    known = [one.value is not None and np.isfinite(one.value) for one in (*out, found)]
+    return [one if k else replace(one, verdict=None) for one, k in zip((*out, found), known, strict=True)]
 
 
 def _in_all(name: str, people: _People, rule: str, by: Mapping[str, Floats]) -> Finding:
