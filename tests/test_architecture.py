@@ -239,9 +239,9 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 99910,  # studies over people; eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 99910,  # studies over people; eyes in time: motion, cameras, clips, traces; glasses, for makers and trainers
     "analytic": 1200,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
-    "apps": 18470,  # studies over people, for those who compare trackers; users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
+    "apps": 18470,  # studies over people, and users' own; a rule for each sentence of a paper; two rigs compared
     "backends": 990,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2710,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
     "cli": 2740,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
