@@ -53,10 +53,10 @@ class PopulationSpec(Spec):
         "people stay the same",
     )
 
-    skin_history: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=1.0,
-        description="strength of what years and make-up do to skin: folds, unevenness, liner, shadow; with 0, people "
-        "are the same without these",
+    skin_history: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        default=None,
+        description="strength (default 1) of what years and make-up do to skin: folds, unevenness, liner, shadow; with "
+        "0, people are the same without these",
     )
 
     @model_validator(mode="after")
@@ -100,7 +100,8 @@ class PopulationSpec(Spec):
         if n < 1:
             raise InputError(f"must be >= 1, not {n}", path="n")
         found = _values(self.model, latent_numbers(self.model, Conditions.of(self.model, self.where), seed, first, n))
-        return found | skin_history(found["age_years"], found["male"], self.skin_history, seed, first)
+        strength = 1.0 if self.skin_history is None else self.skin_history
+        return found | skin_history(found["age_years"], found["male"], strength, seed, first)
 
     def person(self, subject: int, seed: int = 0) -> Person:
         """Return one subject."""
