@@ -61,7 +61,7 @@ def test_labels_agree_with_the_pixels(folder):
         if seen == 1:
             np.testing.assert_allclose(centre, truth.pupil.centre_px[row], atol=0.1)
             whole += 1
-    assert 9 <= whole < len(images.entries)  # the lids reach over the pupil when it looks down
+    assert whole >= 9  # the lids leave most pupils free; covered ones are tested with the labels of regions
 
 
 def test_both_observers_agree_within_a_fraction_of_a_pixel(folder):
