@@ -257,7 +257,7 @@ def test_an_ideal_folder_is_read_as_it_was_drawn(drawn):
     assert len(images) == 6
     for image in images:
         assert image.visible == 1.0
-        assert image.hints == {"polarity": "dark", "gamma": 1.0, "radius_px": None, "rig": None}
+        assert image.hints == {"polarity": "dark", "gamma": 1.0, "radius_px": None, "rig": None, "prior": None}
         grey, _ = read_image(image.path)
         y, x = np.mgrid[: grey.shape[0], : grey.shape[1]]
         inside = signed_distance(image.pupil, np.stack([x, y], axis=-1)) < -3.0

@@ -169,7 +169,7 @@ def test_rays_that_slip_between_triangles_are_closed(renderer):
     assert np.mean(there != closed) < 2e-3  # edges within a hundredth of a pixel
     # What they find in addition are gaps: single pixels amid the region, such as (123, 42).
     there, closed = there.reshape(height, width), closed.reshape(height, width)
-    around = ndimage.convolve(there.astype(int), np.ones((3, 3)), mode="nearest")
+    around = ndimage.convolve(there.astype(int), np.ones((3, 3)), mode="mirror")
     assert (around[closed & ~there] == 8).all()
     assert np.count_nonzero(closed & ~there) <= 2
     both = (there & closed).ravel()
