@@ -108,6 +108,8 @@ def test_a_run_over_a_few_people(tmp_path):
     assert "Straight ahead" in (tmp_path / "out" / "report.html").read_text()
     with pytest.raises(InputError, match="image-people"):
         run_study("pupil-size", tmp_path / "out", people=4, image_people=2)
+    with pytest.raises(InputError, match="at most the number of people, 4"):
+        run_study("pupil-size", tmp_path / "out", people=4, observer="image", image_people=5)
 
 
 def test_calibrations_need_their_targets_and_slippage_costs_what_geometry_says(monkeypatch):

@@ -155,6 +155,8 @@ def planned(study: Study, name: str, options: StudyOptions, eyes: Sequence[str] 
         raise InputError(f"the study {name!r} needs {known}, not {observer!r}", source="--observer")
     if options.image_people is not None and not (count and observer in IMAGE_OBSERVERS):
         raise InputError("needs people and an observer of images", source="--image-people")
+    if (options.image_people or 0) > count:
+        raise InputError(f"must be at most the number of people, {count}", source="--image-people")
     preset = Population(options.population or study.population or "adults").preset
     protocols = (options.protocol,) if options.protocol in study.protocols else tuple(study.protocols)
     return StudyPlan(
