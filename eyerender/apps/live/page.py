@@ -190,6 +190,8 @@ class Tab:
     def close(self) -> None:
         """Free the tab's resources."""
         self.rest()
+        if self._summing is not None:
+            self._summing.cancel()
         self._studio.tabs.pop(self.key, None)
 
     # What the page consists of
@@ -276,7 +278,7 @@ class Tab:
             self._lamp_place = [Knob(axis, "mm", 0.5, lambda _: self._move_light()) for axis in AXES]
             self._power = Knob("Intensity", "mW/sr", None, lambda _: self._move_light(), digits=3)
             self._size = Knob("Radius", "mm", 0.05, lambda v: self._light_changed(radius_mm=v), digits=3)
-            self._lobe = Knob("Half-width of its lobe", "°", 0.5, lambda v: self._light_changed(lobe_deg=v), digits=2)
+            self._lobe = Knob("Half-width of its lobe", "°", 0.5, self._widen_lobe, digits=2)
             self._ring = ui.label("").classes("hint")
             with ui.element("div").classes("line"):
                 _button("Aim at the eye", lambda: self._light_changed(aim_mm=self._setup.apex_mm.tolist()))
@@ -285,7 +287,7 @@ class Tab:
         with _group("Camera"):
             self._chosen = _choice("Camera", dict(enumerate(named(spec.rig.cameras))), self._choose_camera)
             self._camera_place = [Knob(axis, "mm", 0.5, lambda _: self._move_camera()) for axis in AXES]
-            self._focal = Knob("Focal length", "mm or px", None, lambda v: self._lengthen(v))
+            self._focal = Knob("Focal length", "mm or px", None, self._lengthen)
             self._field = Knob("Field of view, horizontal", "°", 0.5, self._widen, digits=2)
             self._width = Knob("Width of all pictures", "px", 10, self._resize, digits=0)
             with ui.element("div").classes("line"):
@@ -394,10 +396,17 @@ class Tab:
         self._apply(lambda setup: setup.with_width(round(width_px)))
         self._refresh_focal()
 
-    def _light_changed(self, lobe_deg: float | None = None, **fields: Any) -> None:
-        if lobe_deg is not None:
-            fields["lobe_exponent"] = lobe_exponent(lobe_deg)
+    def _light_changed(self, **fields: Any) -> None:
         self._apply(lambda setup: setup.with_light(self._light, **fields))
+        self._note_ring()
+
+    def _widen_lobe(self, half_width: float) -> None:
+        self._apply(lambda setup: setup.with_light(self._light, lobe_exponent=lobe_exponent(half_width)))
+        self._note_ring()
+
+    def _note_ring(self) -> None:
+        """Say whether the chosen LED belongs to a ring, which a change of it ends."""
+        self._ring.set_text(ring_note(self._setup.scene.spec.rig, self._light))
 
     def _choose_light(self, light: int) -> None:
         self._light = light
@@ -423,7 +432,7 @@ class Tab:
 
     def _move_light(self) -> None:
         place, power = [knob.value for knob in self._lamp_place], self._power.value
-        self._apply(lambda setup: setup.with_light(self._light, position_mm=place, intensity_mw_sr=power))
+        self._light_changed(position_mm=place, intensity_mw_sr=power)
 
     def _move_camera(self) -> None:
         place = [knob.value for knob in self._camera_place]
@@ -510,7 +519,7 @@ class Tab:
         self._power.set(lamp.intensity_mw_sr, 0, _round_up(3 * lamp.intensity_mw_sr))
         self._size.set(lamp.radius_mm, 0, max(3.0, 2 * lamp.radius_mm))
         self._lobe.set(half_width_deg(lamp.lobe_exponent), 2, 90)
-        self._ring.set_text(ring_note(self._setup.scene.spec.rig, self._light))
+        self._note_ring()
 
     @contextmanager
     def _silence(self) -> Iterator[None]:
