@@ -94,21 +94,13 @@ class Result:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySize:
-    """Size of a survey.
+    """Size of a survey."""
 
-    Attributes:
-        seed: seed of the draw.
-        count: number of people in the statistics and in the table.
-        check: number of people whose eyes are built, to count the impossible ones.
-        faces: number of people whose eyes are rendered; 0 for none.
-        spp: samples per pixel of the faces.
-    """
-
-    seed: int = 0
-    count: int = 10_000
-    check: int = 200
-    faces: int = 16
-    spp: int = 16
+    seed: int = 0  # seed of the draw
+    count: int = 10_000  # number of people in the statistics and in the table
+    check: int = 200  # number of people whose eyes are built, to count the impossible ones
+    faces: int = 16  # number of people whose eyes are rendered; 0 for none
+    spp: int = 16  # samples per pixel of the faces
 
     def __post_init__(self) -> None:
         """Raise an error for numbers out of range, naming the command's option."""

@@ -33,27 +33,16 @@ VARIANTS: dict[BackendName, str] = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mon
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Backend:
-    """The backend that renders in this process.
+    """The backend that renders in this process."""
 
-    Attributes:
-        name: cuda or llvm.
-        variant: Mitsuba's variant.
-        device: name of the processor or the GPU.
-        threads: size of Dr.Jit's thread pool.
-        mitsuba: version of Mitsuba.
-        drjit: version of Dr.Jit.
-        llvm: version of libLLVM; None with cuda.
-        library: file of libLLVM; None with cuda.
-    """
-
-    name: BackendName
-    variant: str
-    device: str
-    threads: int
-    mitsuba: str
-    drjit: str
-    llvm: str | None = None
-    library: str | None = None
+    name: BackendName  # cuda or llvm
+    variant: str  # Mitsuba's variant
+    device: str  # name of the processor or the GPU
+    threads: int  # size of Dr.Jit's thread pool
+    mitsuba: str  # version of Mitsuba
+    drjit: str  # version of Dr.Jit
+    llvm: str | None = None  # version of libLLVM; None with cuda
+    library: str | None = None  # file of libLLVM; None with cuda
 
     @property
     def versions(self) -> dict[str, str]:

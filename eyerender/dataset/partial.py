@@ -51,17 +51,12 @@ CHECKPOINT_S = 10.0
 
 
 class PartialShard:
-    """A shard in the making; a context manager that resumes the finished samples of an earlier worker.
-
-    Attributes:
-        made: numbers of the finished samples, including those that were given up.
-        images: number of their images.
-    """
+    """A shard in the making; a context manager that resumes the finished samples of an earlier worker."""
 
     def __init__(self, plan: Plan, backend: dict[str, Any], folder: Path, shard: int) -> None:
         self.plan, self.shard, self.folder = plan, shard, folder
-        self.made: set[int] = set()
-        self.images = 0
+        self.made: set[int] = set()  # numbers of the finished samples, including those that were given up
+        self.images = 0  # number of their images
         self._start = self._checkpoint = self._last = time.monotonic()  # of worker, checkpoint and sample
         self._before = 0.0  # seconds of earlier workers
         self._made_by = {"digest": plan.digest, "versions": run_versions(), "backend": backend, "cpu": cpu_family()}

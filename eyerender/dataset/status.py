@@ -34,15 +34,11 @@ _TIME = "%Y-%m-%dT%H:%M:%SZ"
 
 
 class Log:
-    """Writer of the log of one part of a run, from its start on.
-
-    Attributes:
-        written: when an event was last written.
-    """
+    """Writer of the log of one part of a run, from its start on."""
 
     def __init__(self, folder: Path, part: tuple[int, int]) -> None:
         self._path, self._part, self._start = folder / LOG, part, time.monotonic()
-        self.written = 0.0
+        self.written = 0.0  # when an event was last written
 
     @property
     def seconds(self) -> float:

@@ -89,12 +89,6 @@ class VideoReader:
 
     Frames that cannot be read are left out, and the frames after them keep their numbers.
 
-    Attributes:
-        frames_per_s: frame rate that the file states, else 25.
-        count: number of frames that the file states, else 0.
-        gaps: first and last number of each run of frames that cannot be read, but for those at the end.
-        read: number of frames that were read.
-
     Raises:
         InputError: the file is missing, not a regular file or not a video, or its frames are too large.
     """
@@ -112,14 +106,16 @@ class VideoReader:
         if not 0 < size[0] * size[1] <= MAX_PIXELS:
             raise InputError(f"has frames of {size[0]:.0f} x {size[1]:.0f} px", source=self.source)
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
+        # frame rate that the file states, else 25
         self.frames_per_s = rate if math.isfinite(rate) and 0.0 < rate <= 1e6 else 25.0
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self.count = int(count) if 0 < count < 1e9 else 0
+        self.count = int(count) if 0 < count < 1e9 else 0  # number of frames that the file states, else 0
 
         code = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin-1")
         self._codec = f" (codec {code})" if code.isalnum() else ""
+        # first and last number of each run of frames that cannot be read, but for those at the end
         self.gaps: list[tuple[int, int]] = []
-        self.read = 0
+        self.read = 0  # number of frames that were read
         self._last = VideoFrame(-1, -1.0 / self.frames_per_s, np.zeros((0, 0), np.uint8), False)
         self._lost = _lost_in_avi(path) if reader == "avi" else frozenset[int]()
         # MP4 and AVI list their frames. Others state a duration and a rate, from which OpenCV computes the number.

@@ -80,24 +80,14 @@ HUMAN_BOUNDS = ParameterBounds()
 
 
 class Calibration(Spec):
-    """Calibrated parameters of one eye, and how the search ended.
+    """Calibrated parameters of one eye, and how the search ended."""
 
-    Attributes:
-        parameters: the result.
-        start: where the search started.
-        objective: what was minimised.
-        cost: final value of the objective (mm^2, mm or degrees, depending on the objective).
-        evaluations: number of evaluations of the model.
-        converged: whether the search converged.
-        message: how it ended.
-        at_bound: parameters that a bound limits.
-    """
-
-    parameters: EyeParameters
-    start: EyeParameters
-    objective: str
+    parameters: EyeParameters  # the result
+    start: EyeParameters  # where the search started
+    objective: str  # what was minimised
+    # final value of the objective (mm^2, mm or degrees, depending on the objective)
     cost: Annotated[float, Field(ge=0)]
-    evaluations: Annotated[int, Field(ge=0, lt=2**53)]
-    converged: bool
-    message: str
-    at_bound: Annotated[tuple[str, ...], Field(max_length=5)]
+    evaluations: Annotated[int, Field(ge=0, lt=2**53)]  # number of evaluations of the model
+    converged: bool  # whether the search converged
+    message: str  # how it ended
+    at_bound: Annotated[tuple[str, ...], Field(max_length=5)]  # parameters that a bound limits

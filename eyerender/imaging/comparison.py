@@ -21,25 +21,15 @@ SCHEMA = "eyerender/compare/2"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureErrors(ArrayValue):
-    """Image-derived minus analytic features, NaN if one of the two is missing.
+    """Image-derived minus analytic features, NaN if one of the two is missing."""
 
-    Attributes:
-        centre_px: (n, 2) errors of the pupil's centre.
-        semi_axes_px: (n, 2) errors of the semi-axes.
-        glint_px: (n, m, 2) errors of glints, in the order of the analytic glints.
-        pupil_expected: (n,) whether the analytic observer sees the pupil on the sensor.
-        pupil_found: (n,) whether it was also detected in the image.
-        glint_expected: (n, m) the same for glints.
-        glint_found: (n, m) the same for glints.
-    """
-
-    centre_px: Floats
-    semi_axes_px: Floats
-    glint_px: Floats
-    pupil_expected: Bools
-    pupil_found: Bools
-    glint_expected: Bools
-    glint_found: Bools
+    centre_px: Floats  # (n, 2) errors of the pupil's centre
+    semi_axes_px: Floats  # (n, 2) errors of the semi-axes
+    glint_px: Floats  # (n, m, 2) errors of glints, in the order of the analytic glints
+    pupil_expected: Bools  # (n,) whether the analytic observer sees the pupil on the sensor
+    pupil_found: Bools  # (n,) whether it was also detected in the image
+    glint_expected: Bools  # (n, m) the same for glints
+    glint_found: Bools  # (n, m) the same for glints
 
     def summary(self) -> dict[str, Any]:
         """Return medians, 95th percentiles, maxima and mean vectors in px, and the counts."""

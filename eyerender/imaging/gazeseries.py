@@ -52,31 +52,18 @@ class Display(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GazeSeries:
-    """Samples of one eye.
+    """Samples of one eye."""
 
-    Attributes:
-        eye: `right` or `left`.
-        rate_hz: samples per second.
-        time_s: (n,) times.
-        place: (n, 2) gaze: px on the display, else azimuth and elevation in degrees; NaN where it is missing.
-        direction: (n, 3) true line of sight in the world.
-        origin_mm: (n, 3) points on it.
-        pupil_mm: (n,) diameter of the stop; NaN where the pupil is missing.
-        lid_opening_mm: (n,) opening of the lids; NaN if unknown.
-        events: (n,) what happens, joined by `+`.
-        display: where gaze is stated; None: in degrees.
-    """
-
-    eye: str
-    rate_hz: float
-    time_s: Floats
-    place: Floats
-    direction: Floats
-    origin_mm: Floats
-    pupil_mm: Floats
-    lid_opening_mm: Floats
-    events: Objects
-    display: Display | None
+    eye: str  # `right` or `left`
+    rate_hz: float  # samples per second
+    time_s: Floats  # (n,) times
+    place: Floats  # (n, 2) gaze: px on the display, else azimuth and elevation in degrees; NaN where it is missing
+    direction: Floats  # (n, 3) true line of sight in the world
+    origin_mm: Floats  # (n, 3) points on it
+    pupil_mm: Floats  # (n,) diameter of the stop; NaN where the pupil is missing
+    lid_opening_mm: Floats  # (n,) opening of the lids; NaN if unknown
+    events: Objects  # (n,) what happens, joined by `+`
+    display: Display | None  # where gaze is stated; None: in degrees
 
 
 class Stretch(NamedTuple):

@@ -37,19 +37,12 @@ _POINTS = 12  # of an outline: an ellipse has five numbers, and the image of a r
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Trace:
-    """Samples of a sequence: a row for each time, camera and eye.
+    """Samples of a sequence: a row for each time, camera and eye."""
 
-    Attributes:
-        tracker: who sampled.
-        scene: what was sampled.
-        observations: truth, and features with the tracker's noise; missing ones have a status.
-        lid_opening_mm: (n,) opening of the lids; NaN for a bare eye.
-    """
-
-    tracker: Tracker
-    scene: Scene
-    observations: Observations
-    lid_opening_mm: Floats
+    tracker: Tracker  # who sampled
+    scene: Scene  # what was sampled
+    observations: Observations  # truth, and features with the tracker's noise; missing ones have a status
+    lid_opening_mm: Floats  # (n,) opening of the lids; NaN for a bare eye
 
     def header(self) -> list[str]:
         """Return the names of the columns."""

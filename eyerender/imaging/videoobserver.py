@@ -46,15 +46,10 @@ class VideoSummary:
 
 @dataclass(frozen=True, slots=True)
 class VideoOutput:
-    """Files written for an observed video.
+    """Files written for an observed video."""
 
-    Attributes:
-        records: one record per line (JSON), or a table (.csv) of `features_csv`.
-        overlay: video with the results drawn over the frames (.mp4, .avi or .mkv).
-    """
-
-    records: Path | None = None
-    overlay: Path | None = None
+    records: Path | None = None  # one record per line (JSON), or a table (.csv) of `features_csv`
+    overlay: Path | None = None  # video with the results drawn over the frames (.mp4, .avi or .mkv)
 
 
 def observe_video(

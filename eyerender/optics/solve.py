@@ -38,25 +38,15 @@ class ApparentPoints(ArrayValue):
 
 
 class Rays(NamedTuple):
-    """Rays from a viewpoint to a point through surfaces, one array per coordinate.
+    """Rays from a viewpoint to a point through surfaces, one array per coordinate."""
 
-    Attributes:
-        exit: the point on the outermost surface.
-        way: unit direction from the viewpoint to it.
-        end: unit direction in the last medium.
-        met: the point on the surface with a rim; NaN behind lenses where the ray was found by shooting.
-        arriving: unit direction before it; NaN like `met`.
-        residual_mm: miss distance of the traced ray.
-        status: (...,).
-    """
-
-    exit: Xyz
-    way: Xyz
-    end: Xyz
-    met: Xyz
-    arriving: Xyz
-    residual_mm: Floats
-    status: Statuses
+    exit: Xyz  # the point on the outermost surface
+    way: Xyz  # unit direction from the viewpoint to it
+    end: Xyz  # unit direction in the last medium
+    met: Xyz  # the point on the surface with a rim; NaN behind lenses where the ray was found by shooting
+    arriving: Xyz  # unit direction before it; NaN like `met`
+    residual_mm: Floats  # miss distance of the traced ray
+    status: Statuses  # (...,)
 
 
 def apparent_points(

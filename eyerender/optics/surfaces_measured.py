@@ -124,18 +124,14 @@ _FAR_MM = 1e6
 
 
 class Measured(GraphSurface):
-    """A measured surface inside a biconic.
-
-    Attributes:
-        outer: (..., 8) the outer biconic: R_u, R_v, Q_u, Q_v, the angle of u from y (rad), the height at the axis (mm),
-            and the slopes along y and z of the plane on which it stands.
-        window_mm: (..., 2) radii at which the transition begins and ends.
-    """
+    """A measured surface inside a biconic."""
 
     __slots__ = ()
 
+    # (..., 8) the outer biconic: R_u, R_v, Q_u, Q_v, the angle of u from y (rad), the height at the axis (mm), and the
+    # slopes along y and z of the plane on which it stands
     outer: Floats
-    window_mm: Floats
+    window_mm: Floats  # (..., 2) radii at which the transition begins and ends
 
     def write(self, sheets: Sheets, table: list[Floats]) -> int:
         """Write the shape into records that hold its place, and its coefficients into the table."""

@@ -51,19 +51,12 @@ class Population(PopulationSpec):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class People:
-    """People as arrays: `people["axial_length_mm"]` is (n, 2) for right and left, `people["age_years"]` is (n,).
+    """People as arrays: `people["axial_length_mm"]` is (n, 2) for right and left, `people["age_years"]` is (n,)."""
 
-    Attributes:
-        population: the population from which they are drawn.
-        seed: the seed.
-        number: (n,) number of each subject.
-        values: name -> (n,) or (n, 2); see `PopulationSpec.numbers`.
-    """
-
-    population: PopulationSpec
+    population: PopulationSpec  # the population from which they are drawn
     seed: int
-    number: Ints
-    values: Mapping[str, Floats]
+    number: Ints  # (n,) number of each subject
+    values: Mapping[str, Floats]  # name -> (n,) or (n, 2); see `PopulationSpec.numbers`
 
     def __len__(self) -> int:
         return len(self.number)

@@ -17,17 +17,11 @@ from ..rig.camera import PinholeCamera
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CameraPastLenses(PinholeCamera):
-    """A camera whose `project` follows rays through worn lenses.
+    """A camera whose `project` follows rays through worn lenses."""
 
-    Attributes:
-        lenses: the lenses, in the frame of the unrotated eye.
-        apex_mm: (3,) origin of that frame in the world.
-        thorough: whether rays that are hard to find are searched; labels need them, choices of samples do not.
-    """
-
-    lenses: tuple[WornLens, ...]
-    apex_mm: Floats
-    thorough: bool
+    lenses: tuple[WornLens, ...]  # the lenses, in the frame of the unrotated eye
+    apex_mm: Floats  # (3,) origin of that frame in the world
+    thorough: bool  # whether rays that are hard to find are searched; labels need them, choices of samples do not
 
     def project(self, points_mm: ArrayLike) -> tuple[Floats, Bools]:
         """Project world points (..., 3) as `PinholeCamera.project`; points without a ray as if no lens were there."""

@@ -19,41 +19,24 @@ NO_HINTS: dict[str, Any] = {"polarity": "auto", "gamma": 1.0, "radius_px": None,
 
 
 class RigHints(Spec):
-    """Camera and lights, in the form given to extractors.
+    """Camera and lights, in the form given to extractors."""
 
-    Attributes:
-        K: camera matrix, px.
-        R: rotation from the world to the camera.
-        t_mm: translation from the world to the camera.
-        distortion: as of a camera of a scene.
-        lights_mm: positions of the lights in the world.
-        eye_mm: approximate position of the eye in the world.
-        eye_sd_mm: its standard deviation per axis.
-    """
-
-    K: tuple[Vec3, Vec3, Vec3]
-    R: tuple[Vec3, Vec3, Vec3]
-    t_mm: Vec3
-    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
-    lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=1000)]
-    eye_mm: Vec3
-    eye_sd_mm: NonNegative = 5.0
+    K: tuple[Vec3, Vec3, Vec3]  # camera matrix, px
+    R: tuple[Vec3, Vec3, Vec3]  # rotation from the world to the camera
+    t_mm: Vec3  # translation from the world to the camera
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  # as of a camera of a scene
+    lights_mm: Annotated[tuple[Vec3, ...], Field(max_length=1000)]  # positions of the lights in the world
+    eye_mm: Vec3  # approximate position of the eye in the world
+    eye_sd_mm: NonNegative = 5.0  # its standard deviation per axis
 
 
 class FolderHints(Spec):
-    """Hints for every image of a folder; a missing key is unknown.
+    """Hints for every image of a folder; a missing key is unknown."""
 
-    Attributes:
-        gamma: encoding gamma of the pixel values, 1 for linear ones.
-        polarity: whether the pupil is darker or brighter than the iris.
-        radius_px: smallest and largest semi-axis of a pupil.
-        rig: camera and lights.
-    """
-
-    gamma: Annotated[float, Field(ge=0.1, le=10)] | None = None
-    polarity: Literal["dark", "bright", "auto"] = "auto"
-    radius_px: tuple[Positive, Positive] | None = None
-    rig: RigHints | None = None
+    gamma: Annotated[float, Field(ge=0.1, le=10)] | None = None  # encoding gamma of the pixel values, 1 for linear ones
+    polarity: Literal["dark", "bright", "auto"] = "auto"  # whether the pupil is darker or brighter than the iris
+    radius_px: tuple[Positive, Positive] | None = None  # smallest and largest semi-axis of a pupil
+    rig: RigHints | None = None  # camera and lights
 
     @classmethod
     def load(cls, folder: Path) -> FolderHints:

@@ -149,21 +149,13 @@ def separability(one: FolderFigures, other: FolderFigures, seed: int = 0) -> dic
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut:
-    """How well a folder is told from a camera that the classifier never saw, and how well a camera from the others.
+    """How well a folder is told from a camera that the classifier never saw, and how well a camera from the others."""
 
-    Attributes:
-        cameras: number of cameras with enough images.
-        auc: mean area under the ROC curve of the first folder over the cameras that were left out.
-        interval: its 5 % and 95 % quantiles over images drawn with replacement.
-        placebo: the mean area of one camera, told from the others, over all pairs of cameras.
-        placebo_interval: the 5 % and 95 % quantiles of the areas of these pairs.
-    """
-
-    cameras: int
-    auc: float
-    interval: tuple[float, float]
-    placebo: float
-    placebo_interval: tuple[float, float]
+    cameras: int  # number of cameras with enough images
+    auc: float  # mean area under the ROC curve of the first folder over the cameras that were left out
+    interval: tuple[float, float]  # its 5 % and 95 % quantiles over images drawn with replacement
+    placebo: float  # the mean area of one camera, told from the others, over all pairs of cameras
+    placebo_interval: tuple[float, float]  # the 5 % and 95 % quantiles of the areas of these pairs
 
     def to_mapping(self) -> dict[str, Any]:
         """Convert to a mapping for JSON."""

@@ -20,19 +20,14 @@ COPIES, EPOCHS = 8, 3  # random changes of each picture, and how often a network
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class NetworkErrors:
-    """Mean errors of the people of a test, for networks that were trained on one set of pictures.
+    """Mean errors of the people of a test, for networks that were trained on one set of pictures."""
 
-    Attributes:
-        trained_on: name of that set.
-        error_deg: by name of the tested set, (2, seeds, people) before and after nine points; nan where fewer than ten
-            pictures of a person show the gaze.
-        of_the_mean_deg: mean error on that set's own test if the mean direction is stated every time.
-        people, pictures: number of people and of pictures that the networks learnt from, before random changes.
-    """
-
-    trained_on: str
+    trained_on: str  # name of that set
+    # by name of the tested set, (2, seeds, people) before and after nine points; nan where fewer than ten pictures of a
+    # person show the gaze
     error_deg: Mapping[str, Floats]
-    of_the_mean_deg: float
+    of_the_mean_deg: float  # mean error on that set's own test if the mean direction is stated every time
+    # number of people and of pictures that the networks learnt from, before random changes
     people: int
     pictures: int
 

@@ -38,30 +38,18 @@ _STEPS = ("image-noiseless", "image")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Term:
-    """A contribution in degrees.
+    """A contribution in degrees."""
 
-    Attributes:
-        name: the cause.
-        deg: its net effect on the mean error.
-        low_deg: lower end of the 95 % interval, if it is a difference.
-        high_deg: upper end.
-        rms_deg: rms angle between the paired estimates; of the algorithm, between estimate and truth.
-        shift_deg: part common to all frames of an eye.
-        pattern_deg: part that differs between the frames and repeats with every seed; with one exposure it includes
-            noise.
-        scatter_deg: part that differs between noise seeds; None for one seed.
-        seeds: number of exposures with other noise; None for one exposure.
-    """
-
-    name: str
-    deg: float
-    low_deg: float | None = None
-    high_deg: float | None = None
-    rms_deg: float | None = None
-    shift_deg: float | None = None
+    name: str  # the cause
+    deg: float  # its net effect on the mean error
+    low_deg: float | None = None  # lower end of the 95 % interval, if it is a difference
+    high_deg: float | None = None  # upper end
+    rms_deg: float | None = None  # rms angle between the paired estimates; of the algorithm, between estimate and truth
+    shift_deg: float | None = None  # part common to all frames of an eye
+    # part that differs between the frames and repeats with every seed; with one exposure it includes noise
     pattern_deg: float | None = None
-    scatter_deg: float | None = None
-    seeds: int | None = None
+    scatter_deg: float | None = None  # part that differs between noise seeds; None for one seed
+    seeds: int | None = None  # number of exposures with other noise; None for one exposure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

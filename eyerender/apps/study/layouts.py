@@ -22,19 +22,12 @@ _SENSOR = {"f_number": 2.2, "exposure_ms": 2.0, "pixel_pitch_um": 3.0, "full_wel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownLayout:
-    """A layout of the study.
+    """A layout of the study."""
 
-    Attributes:
-        name: name of the layout.
-        text: short description.
-        headset: whether the rig moves with the head.
-        scene: mapping of its scene.
-    """
-
-    name: str
-    text: str
-    headset: bool
-    scene: dict[str, Any]
+    name: str  # name of the layout
+    text: str  # short description
+    headset: bool  # whether the rig moves with the head
+    scene: dict[str, Any]  # mapping of its scene
 
     @property
     def slippage_mm(self) -> float:

@@ -48,31 +48,24 @@ class Row:
 
 @dataclass(slots=True, kw_only=True)
 class ModelResults:
-    """Results of a study for one eye model.
+    """Results of a study for one eye model."""
 
-    Attributes:
-        eye_model: the eye model, or the name of a drawn person.
-        person: the choice of a drawn person: preset, seed, subject.
-        rows: mean errors.
-        seen: rig and observations, by (protocol, observer).
-        errors: errors (n,) deg, by (protocol, observer) and estimator.
-        vectors: error vectors (n, 2) deg to the right and up (`error_vectors_deg`).
-        seed_vectors: error vectors (s, n, 2) of s further exposures of images without noise, each with other noise.
-        done: results of the estimators, by (protocol, observer) and estimator.
-        waterfall: errors as departures are corrected one after the other.
-        more: what a study computes besides.
-    """
-
-    eye_model: str
-    person: Mapping[str, Any] | None = None
-    rows: list[Row] = field(default_factory=list)
+    eye_model: str  # the eye model, or the name of a drawn person
+    person: Mapping[str, Any] | None = None  # the choice of a drawn person: preset, seed, subject
+    rows: list[Row] = field(default_factory=list)  # mean errors
+    # rig and observations, by (protocol, observer)
     seen: dict[tuple[str, str], tuple[RigGeometry, Observations]] = field(default_factory=dict)
+    # errors (n,) deg, by (protocol, observer) and estimator
     errors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+    # error vectors (n, 2) deg to the right and up (`error_vectors_deg`)
     vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+    # error vectors (s, n, 2) of s further exposures of images without noise, each with other noise
     seed_vectors: dict[tuple[str, str], dict[str, Floats]] = field(default_factory=dict)
+    # results of the estimators, by (protocol, observer) and estimator
     done: dict[tuple[str, str], Any] = field(default_factory=dict)
+    # errors as departures are corrected one after the other
     waterfall: list[WaterfallStep] = field(default_factory=list)
-    more: dict[str, Any] = field(default_factory=dict)
+    more: dict[str, Any] = field(default_factory=dict)  # what a study computes besides
 
 
 def keys_of(parts: Sequence[ModelResults]) -> list[tuple[str, str]]:

@@ -50,17 +50,11 @@ GOALS = {"noise_deg": 1, "dropout": 1, "leds": 1, "cornea_w_m2": 1, "sharp_depth
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepRun:
-    """Options of a sweep run.
+    """Options of a sweep run."""
 
-    Attributes:
-        workers: processes; None: one for each processor.
-        part: (K, N): evaluate only every N-th layout, beginning with the K-th.
-        overwrite: replace the contents of the folder.
-    """
-
-    workers: int | None = None
-    part: tuple[int, int] = (1, 1)
-    overwrite: bool = False
+    workers: int | None = None  # processes; None: one for each processor
+    part: tuple[int, int] = (1, 1)  # (K, N): evaluate only every N-th layout, beginning with the K-th
+    overwrite: bool = False  # replace the contents of the folder
 
 
 def run_sweep(

@@ -136,19 +136,12 @@ class SweepSpec(FileSpec):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigLayout:
-    """One layout of a sweep.
+    """One layout of a sweep."""
 
-    Attributes:
-        number: its number in the sweep.
-        values: the varied values, for tables.
-        scene: mapping of its scene.
-        lights: number of LEDs to choose from those of the scene.
-    """
-
-    number: int
-    values: Mapping[str, Any]
-    scene: Mapping[str, Any]
-    lights: int
+    number: int  # its number in the sweep
+    values: Mapping[str, Any]  # the varied values, for tables
+    scene: Mapping[str, Any]  # mapping of its scene
+    lights: int  # number of LEDs to choose from those of the scene
 
 
 def layouts_of(spec: SweepSpec, scene: Scene) -> list[RigLayout]:

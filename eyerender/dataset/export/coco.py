@@ -69,21 +69,13 @@ def write(items: Items, out: Path) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Annotated:
-    """An image with its annotations.
+    """An image with its annotations."""
 
-    Attributes:
-        split: its split.
-        picture: its file.
-        image: its keys without `id`.
-        marks: its instances.
-        eye: its keypoints, if it shows an eye.
-    """
-
-    split: str
-    picture: bytes
-    image: dict[str, Any]
-    marks: list[dict[str, Any]]
-    eye: dict[str, Any] | None
+    split: str  # its split
+    picture: bytes  # its file
+    image: dict[str, Any]  # its keys without `id`
+    marks: list[dict[str, Any]]  # its instances
+    eye: dict[str, Any] | None  # its keypoints, if it shows an eye
 
 
 def _annotated(item: Item, lights: int) -> _Annotated:

@@ -10,38 +10,23 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Habits:
-    """Habits of a person's eyes; spreads are chosen unless a source is named.
+    """Habits of a person's eyes; spreads are chosen unless a source is named."""
 
-    Attributes:
-        duration: duration of saccades relative to the mean (a coefficient of variation of 12 %).
-        skew: share of a saccade's duration in which it accelerates, relative to the mean.
-        fixation: duration of fixations relative to the mean.
-        drift: speed of drift relative to the mean.
-        oscillation_mm: gain of the oscillation of the pupil after saccades.
-        oscillation_hz: its frequency, 15 to 20 Hz (Bouzat et al. 2018).
-        oscillation_damping: its damping, 0.1 to 0.4.
-        blinks: rate of blinks relative to the mean (19.8 +- 4.9 per minute over 10 people who watched a film).
-        closing_s: duration of the closing of a blink.
-        retraction_mm: how far a complete blink draws the globe back: 0.3 to 1 mm, under 1 mm after Riggs et al. 1987
-            (Vision Res. 27); Doane 1980 saw 1 to 6 mm.
-        nasal_deg: turn of the eyes in a complete blink, nasal and down (1 to 2 degrees).
-        latency_s: latency of the pupil's reflex to light, 0.18 to 0.25 s.
-        constriction_s: time constant of constriction, 0.2 to 0.3 s; dilation takes 3.5 times as long.
-    """
-
-    duration: float
-    skew: float
-    fixation: float
-    drift: float
-    oscillation_mm: float
-    oscillation_hz: float
-    oscillation_damping: float
-    blinks: float
-    closing_s: float
+    duration: float  # duration of saccades relative to the mean (a coefficient of variation of 12 %)
+    skew: float  # share of a saccade's duration in which it accelerates, relative to the mean
+    fixation: float  # duration of fixations relative to the mean
+    drift: float  # speed of drift relative to the mean
+    oscillation_mm: float  # gain of the oscillation of the pupil after saccades
+    oscillation_hz: float  # its frequency, 15 to 20 Hz (Bouzat et al. 2018)
+    oscillation_damping: float  # its damping, 0.1 to 0.4
+    blinks: float  # rate of blinks relative to the mean (19.8 +- 4.9 per minute over 10 people who watched a film)
+    closing_s: float  # duration of the closing of a blink
+    # how far a complete blink draws the globe back: 0.3 to 1 mm, under 1 mm after Riggs et al. 1987 (Vision Res. 27);
+    # Doane 1980 saw 1 to 6 mm
     retraction_mm: float
-    nasal_deg: float
-    latency_s: float
-    constriction_s: float
+    nasal_deg: float  # turn of the eyes in a complete blink, nasal and down (1 to 2 degrees)
+    latency_s: float  # latency of the pupil's reflex to light, 0.18 to 0.25 s
+    constriction_s: float  # time constant of constriction, 0.2 to 0.3 s; dilation takes 3.5 times as long
 
     @classmethod
     def drawn(cls, seed: tuple[int, ...]) -> Self:
