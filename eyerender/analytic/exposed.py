@@ -30,11 +30,8 @@ def at_own_times(
     """Replace features of n rows at the time of their frame by features at their own times.
 
     `timings` are the times of the frames of each camera; `traced` computes the features of rows (indices) at other
-    times.
-
-    Returns:
-        The features, the time of each pupil's centre (n,) and of each glint (n, m). A point whose row gets no light is
-        UNLIT.
+    times. Returns the features, the time of each pupil's centre (n,) and of each glint (n, m). A point whose row gets
+    no light is UNLIT.
     """
     n, k = seen.point_status.shape
     m = seen.glint_status.shape[1]

@@ -55,10 +55,8 @@ def load_llvm(library: Path) -> None:
     """Load a libLLVM and the libraries that it and Dr.Jit need.
 
     Their symbols stay private (RTLD_LOCAL); the loader finds a loaded dependency by name anyway. Public symbols would
-    replace the system's C++ runtime in libraries that are loaded later.
-
-    Raises:
-        OSError: a dependency is missing, or the library does not fit this system.
+    replace the system's C++ runtime in libraries that are loaded later. Raises OSError if a dependency is missing, or
+    the library does not fit this system.
     """
     load_runtime()
     for name in _BESIDE_LLVM:

@@ -25,14 +25,9 @@ PAUSES_S = (3.0, 10.0)
 def fetch_library(package: str, name: str, store: Path) -> None:
     """Fetch a package and extract one of its libraries; nothing on the system changes.
 
-    Args:
-        package: the package.
-        name: file name of the library.
-        store: folder that receives the file, replaced at once if another process wrote it meanwhile.
-
-    Raises:
-        BackendError: the archive does not respond, or the package lacks the library.
-        OSError: the folder cannot be written.
+    `name`: file name of the library; `store`: folder that receives the file, replaced at once if another process wrote
+    it meanwhile. Raises BackendError if the archive does not respond, or the package lacks the library; OSError if the
+    folder cannot be written.
     """
     store.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="fetch-", dir=store) as scratch:
@@ -110,13 +105,9 @@ def setup_llvm(*, say: Say = _silent) -> LibLlvm:
     """Find a libLLVM that renders, after fetching the libraries of Dr.Jit that this machine lacks.
 
     They come from Debian's or Ubuntu's archive, without root. They are fetched with the machine's own apt settings but
-    into a folder of this package, so nothing on the system changes.
-
-    Args:
-        say: receives one line for each step that takes time.
-
-    Raises:
-        BackendError: something is missing that cannot be fetched; the message names the command that installs it.
+    into a folder of this package, so nothing on the system changes. `say`: receives one line for each step that takes
+    time. Raises BackendError if something is missing that cannot be fetched; the message names the command that
+    installs it.
     """
     try:
         load_runtime()

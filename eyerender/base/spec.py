@@ -98,12 +98,8 @@ class Spec(BaseModel):
     def __init__(self, *values: Any, **fields: Any) -> None:
         """Build a record from Python values; lists and NumPy arrays are accepted for tuples, mappings for records.
 
-        Args:
-            values: fields by position, in the order of `POSITIONAL`.
-            fields: fields by name.
-
-        Raises:
-            InputError: a value does not fit; the message is the same as for a YAML file with this value.
+        `values`: fields by position, in the order of `POSITIONAL`; `fields`: fields by name. Raises InputError if a
+        value does not fit; the message is the same as for a YAML file with this value.
         """
         named = dict(zip(self.POSITIONAL, values, strict=False))
         if len(named) < len(values) or named.keys() & fields.keys():
@@ -204,11 +200,7 @@ class FileSpec(Spec):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a YAML file.
-
-        Raises:
-            InputError: one line for anything that is wrong with it.
-        """
+        """Read a YAML file. Raises InputError, one line for anything that is wrong with it."""
         data = read_yaml(path)
         cls.refuse_other_kinds(data, source=str(path))
         if "format" not in data:

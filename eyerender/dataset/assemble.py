@@ -58,10 +58,8 @@ def assemble(plan: Plan, folder: Path) -> dict[str, Any]:
     """Assemble the dataset from verified shards and return its statistics.
 
     The same shards give the same bytes. Shards of files then lose their own files of lines, which metadata.jsonl holds.
-
-    Raises:
-        EyerenderError: no sample could be made, or the disk is full or not writable.
-        InputError: a shard's metadata differs from what this version writes.
+    Raises EyerenderError if no sample could be made, or the disk is full or not writable; InputError if a shard's
+    metadata differs from what this version writes.
     """
     for name in (FAILURES, METADATA, INDEX, CROISSANT, CARD, DATASET):
         remove_parts(folder / name)

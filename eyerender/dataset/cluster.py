@@ -81,10 +81,8 @@ class RayEngine:
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
         """Make shards; return those that were given up, with the reasons.
 
-        Raises:
-            InputError: Ray is not installed, or the cluster cannot be reached; or as for the local engine.
-            BackendError: as for the local engine.
-            EyerenderError: as for the local engine.
+        Raises InputError if Ray is not installed, or the cluster cannot be reached; or as for the local engine;
+        BackendError or EyerenderError as for the local engine.
         """
         if find_spec("ray") is None:
             raise InputError("needs Ray (the extra 'ray'); run: pip install ray", source="--engine")

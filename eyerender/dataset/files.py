@@ -19,10 +19,8 @@ from .template import possible
 def sums_of_files(scene: Mapping[str, Any], base: Path) -> dict[str, str]:
     """Compute the SHA-256 of every file that a scene of the template may name, including the files of a manifest.
 
-    Names are kept as written; those in a manifest are relative to `base`, like all others.
-
-    Raises:
-        InputError: a file is missing or cannot be read.
+    Names are kept as written; those in a manifest are relative to `base`, like all others. Raises InputError if a file
+    is missing or cannot be read.
     """
     return {name: sum_of_file(base / name) for name in sorted(set(_names(scene, base)))}
 

@@ -22,10 +22,8 @@ def extended(data: dict[str, Any], file_of: Any, folder: Path, depth: int = 0) -
     """Merge the mapping of a spec into the one that it extends; only mappings are merged, other values are replaced.
 
     So are splits: their shares are one distribution. `file_of` returns the file of a spec by its path or shipped name;
-    names of other files are relative to `folder`. `depth` counts the specs that extend this one.
-
-    Raises:
-        InputError: there is no such spec, or too many extend each other.
+    names of other files are relative to `folder`. `depth` counts the specs that extend this one. Raises InputError if
+    there is no such spec, or too many extend each other.
     """
     if EXTENDS not in data:
         return data

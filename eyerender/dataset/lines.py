@@ -58,9 +58,7 @@ def lines_file(folder: Path, shard: int) -> Path:
 def restore_lines(folder: Path) -> None:
     """Write the files of lines that finished shards lack from metadata.jsonl; the caller has the final lock.
 
-    Raises:
-        OSError: the disk is full or not writable.
-        EyerenderError: the same.
+    Raises OSError or EyerenderError if the disk is full or not writable.
     """
     lacking = [shard for shard in sorted(finished(folder)) if not os.path.lexists(lines_file(folder, shard))]
     if lacking and (folder / METADATA).is_file():

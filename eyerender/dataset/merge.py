@@ -29,20 +29,11 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: Progress | 
     """Put the finished shards of several folders of one run into one folder; assemble the dataset if none is missing.
 
     Only regular files that a shard's done.json lists are copied, and what is copied is compared with the checksums
-    there. A shard that several folders hold is taken from the first. Merging again adds what is missing.
-
-    Args:
-        parts: folders that `generate --shard K/N` has filled, of the same spec, options and versions.
-        out: the folder to write, new or of the same run.
-        progress: called with shards done, shards in all, and "shards".
-
-    Returns:
-        A summary (schema eyerender/merge/1).
-
-    Raises:
-        InputError: a folder holds no run, or one of another spec or version; a shard is damaged; `out` holds something
-            else.
-        EyerenderError: the disk is full or not writable.
+    there. A shard that several folders hold is taken from the first. Merging again adds what is missing. `parts`:
+    folders that `generate --shard K/N` has filled, of the same spec, options and versions; `out`: the folder to write,
+    new or of the same run; `progress`: called with shards done, shards in all, and "shards". Returns a summary (schema
+    eyerender/merge/1). Raises InputError if a folder holds no run, or one of another spec or version; if a shard is
+    damaged; if `out` holds something else; EyerenderError if the disk is full or not writable.
     """
     if not parts:
         raise InputError("give the folders of the parts", source="merge")

@@ -113,10 +113,8 @@ class PlanOptions:
     def apply(self, spec: DatasetSpec, count: int | None = None) -> DatasetSpec:
         """Return the spec with these changes; `count` is the number of samples to make, by default that of the spec.
 
-        Where subjects are replaced, the plan is not continued by new ones: a larger `count` is a larger plan.
-
-        Raises:
-            InputError: a value cannot be parsed, or does not fit.
+        Where subjects are replaced, the plan is not continued by new ones: a larger `count` is a larger plan. Raises
+        InputError if a value cannot be parsed, or does not fit.
         """
         from .picturesize import scaled
 

@@ -145,10 +145,8 @@ class OwnScenes:
 def given_scene(scene: Any, draws: Mapping[str, Any], base: Path, *, source: str = "") -> GivenScene:
     """Take a scene apart: a `Scene`, a `SceneSpec`, or a mapping as in a scene's file.
 
-    The seed 0 of a `Scene` or `SceneSpec` counts as none given, so that no two images share their noise.
-
-    Raises:
-        InputError: it is something else, its eye cannot be read, or a draw is not finite.
+    The seed 0 of a `Scene` or `SceneSpec` counts as none given, so that no two images share their noise. Raises
+    InputError if it is something else, its eye cannot be read, or a draw is not finite.
     """
     for name, value in draws.items():
         try:

@@ -44,11 +44,8 @@ SHARD = "shard"  # folder of the lines of a partial shard
 def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
     """Pack a complete partial shard; return the new content of its done.json.
 
-    The old files are removed last, so that an interrupted packing can be repeated.
-
-    Raises:
-        OSError: the disk is full or not writable.
-        EyerenderError: the same.
+    The old files are removed last, so that an interrupted packing can be repeated. Raises OSError or EyerenderError if
+    the disk is full or not writable.
     """
     lines = [parse_json(raw) for raw in read_bytes(stage / SHARD / LINES, follow=False).splitlines()]
     samples = np.array([line["sample"] for line in lines], dtype=np.int64)
@@ -83,12 +80,8 @@ def pack(stage: Path, done: dict[str, Any], seed: int) -> dict[str, Any]:
 def unpack(stage: Path, done: dict[str, Any]) -> dict[str, Any]:
     """Turn a packed shard in a stage back into a partial one; return the content of its checkpoint.
 
-    The packed files are removed last, so that an interrupted unpacking can be repeated.
-
-    Raises:
-        InputError: the shard is damaged.
-        ValueError: the same.
-        OSError: the disk is full or not writable.
+    The packed files are removed last, so that an interrupted unpacking can be repeated. Raises InputError or ValueError
+    if the shard is damaged; OSError if the disk is full or not writable.
     """
     name = shard_name(done["shard"])
     for own in (TAR, LINES_GZ):

@@ -98,10 +98,8 @@ class PartialShard:
     def add(self, sample: MadeSample) -> None:
         """Write a sample's images and metadata; make a checkpoint if one is due.
 
-        Raises:
-            OSError: the disk is full or not writable.
-            EyerenderError: the same.
-            InputError: a file that the scenes name has changed since the plan was made.
+        Raises OSError or EyerenderError if the disk is full or not writable; InputError if a file that the scenes name
+        has changed since the plan was made.
         """
         self._rejections += [asdict(r) for r in sample.rejections]
         if not sample.images:
@@ -301,10 +299,7 @@ def samples_in(done: Mapping[str, Any]) -> set[int]:
 def set_aside(folder: Path, shard: int) -> None:
     """Turn a finished shard back into a partial one, which `PartialShard` can continue with more or fewer samples.
 
-    If the process is killed between the moves, `take_back` completes them.
-
-    Raises:
-        OSError: a file cannot be moved.
+    If the process is killed between the moves, `take_back` completes them. Raises OSError if a file cannot be moved.
     """
     stage = new_stage(folder, shard)
     stage.mkdir()

@@ -29,10 +29,8 @@ def scaled(scene: Mapping[str, Any], size_px: tuple[int, int]) -> dict[str, Any]
     The lengths are those of the window, blur, sharpening, glare, ghosts, stars, borders and edges of openings. The size
     is that of the images: of the window, or of the sensor if there is no window. The pixel pitch
     (`sensor.pixel_pitch_um`) stays, as if another lens and a sensor with another number of pixels were used, so the
-    exposure stays too.
-
-    Raises:
-        InputError: the images have several sizes or another aspect ratio, or a camera's size is drawn or calibrated.
+    exposure stays too. Raises InputError if the images have several sizes or another aspect ratio, or a camera's size
+    is drawn or calibrated.
     """
     image = scene.get("image")
     window = image.get("window_px") if isinstance(image, Mapping) else None

@@ -568,10 +568,8 @@ def _with_eye(spec: DatasetSpec, eye: str) -> dict[str, Any]:
 def _with_optics(tree: Mapping[str, Any], base: Path) -> dict[str, Any]:
     """Turn the scene of a drawn person into one of the eye model that it names.
 
-    Look, lids, the distance of the eyes and the diameter of the stop remain those of the person.
-
-    Raises:
-        InputError: the person cannot be drawn in this scene.
+    Look, lids, the distance of the eyes and the diameter of the stop remain those of the person. Raises InputError if
+    the person cannot be drawn in this scene.
     """
     model = tree["eye"]["model"]
     rest = {key: value for key, value in tree["eye"].items() if key != "model"}

@@ -84,10 +84,8 @@ class LocalPool:
     def run(self, shards: Iterable[int], events: Events) -> dict[int, str]:
         """Make shards; return those that were given up, with the reasons.
 
-        Raises:
-            BackendError: a worker has no backend to render with.
-            InputError: a file that the scenes name cannot be used, or has changed.
-            EyerenderError: the disk is full or not writable.
+        Raises BackendError if a worker has no backend to render with; InputError if a file that the scenes name cannot
+        be used, or has changed; EyerenderError if the disk is full or not writable.
         """
         left = Retries(shards)
         self._made = 0

@@ -34,10 +34,8 @@ _SHOWN = 4
 def refuse_taken(folder: Path) -> None:
     """Check that a folder holds nothing but a run, before anything is written into it.
 
-    Symbolic links among a run's files are refused too: making or removing shards would change their targets.
-
-    Raises:
-        InputError: the folder holds something else.
+    Symbolic links among a run's files are refused too: making or removing shards would change their targets. Raises
+    InputError if the folder holds something else.
     """
     try:
         link = next(_links(folder), None)
@@ -70,11 +68,9 @@ def begin(folder: Path, plan: Plan, repaired: Say) -> bool:
 
     If run.json is damaged or missing, the finished shards identify the plan, because each names it. If nothing
     identifies it and the folder holds only files of a run, the run starts over. `repaired` is called in both cases. The
-    caller must hold the folder's final lock, so that two parts of a run do not repair it at the same time.
-
-    Raises:
-        InputError: the folder holds something else, or a run of another spec or other versions.
-        OSError: the disk is full or not writable.
+    caller must hold the folder's final lock, so that two parts of a run do not repair it at the same time. Raises
+    InputError if the folder holds something else, or a run of another spec or other versions; OSError if the disk is
+    full or not writable.
     """
     path, mine = folder / RUN, _content(plan)
     found, reason = _read(path)

@@ -52,13 +52,9 @@ def write_shard(
     """Make the samples of a shard in a temporary folder, continuing where an earlier worker stopped.
 
     `on_sample` is called with the number of finished samples and of images of the last one. If `stop`, called before
-    each sample, returns true, samples in progress are finished and no new one is begun.
-
-    Raises:
-        Stopped: `stop` returned true.
-        OSError: the disk is full or not writable.
-        EyerenderError: the same.
-        InputError: a file that the scenes name cannot be used, or has changed since the plan was made.
+    each sample, returns true, samples in progress are finished and no new one is begun. Raises Stopped if `stop`
+    returned true; OSError or EyerenderError if the disk is full or not writable; InputError if a file that the scenes
+    name cannot be used, or has changed since the plan was made.
     """
     maker.plan.check_files()
     samples = maker.plan.spec.shard_samples(shard)
@@ -100,10 +96,7 @@ def commit(folder: Path, staged: Staged) -> None:
     """Put a staged shard in place, done.json last.
 
     If the dataset grows, the finished shard, which holds some of its samples, stays readable. If it shrinks, the
-    finished shard is set aside.
-
-    Raises:
-        OSError: a file cannot be moved.
+    finished shard is set aside. Raises OSError if a file cannot be moved.
     """
     stage = Path(staged.stage)
     if is_finished(folder, staged.shard):
@@ -201,13 +194,8 @@ def verify(folder: Path, shard: int, digest: str | None = None, *, quick: bool =
 def withdraw_damaged(folder: Path, shards: Iterable[int], digest: str) -> dict[int, str]:
     """Verify finished shards, and remove the done.json of damaged ones and those of another plan.
 
-    A run makes these shards again.
-
-    Returns:
-        The withdrawn shards, with the first problem of each.
-
-    Raises:
-        OSError: a done.json cannot be removed.
+    A run makes these shards again. Returns the withdrawn shards, with the first problem of each. Raises OSError if a
+    done.json cannot be removed.
     """
     damaged = {}
     for shard in shards:

@@ -81,9 +81,7 @@ class _Part:
     def take(self, event: dict[str, Any]) -> None:
         """Process an event of the log.
 
-        Raises:
-            KeyError: the event lacks a key.
-            ValueError: a number is not plausible.
+        Raises KeyError if the event lacks a key; ValueError if a number is not plausible.
         """
         kind = event["event"]
         self.last, self.seconds = printable(str(event["time"])[:40]), _number(event["seconds"])

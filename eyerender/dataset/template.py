@@ -108,10 +108,8 @@ class Template:
     ) -> Template:
         """Collect and check all draws, and all references to `variables`, which are drawn per sample or subject.
 
-        With `clips`, what would be drawn per sample is drawn per clip.
-
-        Raises:
-            InputError: with the path of the draw (after `prefix`).
+        With `clips`, what would be drawn per sample is drawn per clip. Raises InputError, with the path of the draw
+        (after `prefix`).
         """
         draws: dict[str, PlacedDraw] = {}
         problems = Problems(source)

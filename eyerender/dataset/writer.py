@@ -100,10 +100,8 @@ class DatasetWriter:
     def __enter__(self) -> Self:
         """Claim the folder, and find what is stored.
 
-        Raises:
-            InputError: it is taken, or holds a run of other arguments or another version.
-            BackendError: there is nothing to render with.
-            EyerenderError: the disk is full or not writable.
+        Raises InputError if it is taken, or holds a run of other arguments or another version; BackendError if there is
+        nothing to render with; EyerenderError if the disk is full or not writable.
         """
         self._session = self._opened()
         self._session.__enter__()

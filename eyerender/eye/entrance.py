@@ -29,10 +29,8 @@ _SETTLED_MM = 1e-10
 def entrance_pupil_mm(eye: EyeModel, *, points: int = POINTS, distance_mm: float = FAR_MM) -> float:
     """Compute the diameter (mm) of the entrance pupil of a single eye: that of the circle of equal area.
 
-    `points` of the margin are seen from the distance `distance_mm`.
-
-    Raises:
-        InputError: a ray from the margin does not leave the eye.
+    `points` of the margin are seen from the distance `distance_mm`. Raises InputError if a ray from the margin does not
+    leave the eye.
     """
     return _diameter(eye.front, tuple(float(n) for n in eye.front_indices), eye.stop, points, distance_mm)
 
@@ -67,10 +65,8 @@ def stop_for_entrance(
     """Compute the diameter (mm) of the stop whose entrance pupil has the diameter `entrance_mm`.
 
     `front` are the refracting surfaces before the stop, outside in, with the index behind each. `stop_of` returns the
-    stop of a diameter, on which its position and shape may depend.
-
-    Raises:
-        InputError: the search does not converge, or a ray does not leave the eye.
+    stop of a diameter, on which its position and shape may depend. Raises InputError if the search does not converge,
+    or a ray does not leave the eye.
     """
 
     def miss(diameter: float) -> float:

@@ -52,10 +52,8 @@ def kappa_deg(eye: EyeModel) -> tuple[float, float]:
 def fovea_of_kappa(eye: EyeModel, wanted_deg: tuple[float, float]) -> Floats:
     """Compute the fovea (3,) mm that gives an eye an angle kappa (horizontal, vertical), nasal and up.
 
-    It is the retinal point on that line of sight; the eye's own fovea is ignored.
-
-    Raises:
-        InputError: the eye has no such line of sight.
+    It is the retinal point on that line of sight; the eye's own fovea is ignored. Raises InputError if the eye has no
+    such line of sight.
     """
     reason = "no place of the fovea gives this angle"
     _, axis = pupillary_axis(eye)
@@ -97,9 +95,7 @@ def alpha_deg(eye: EyeModel, fovea_mm: Floats | None = None, *, distance_mm: flo
     """Compute angles (horizontal, vertical) from the optic axis to the nodal ray of the fovea, nasal and up, degrees.
 
     The fovea (3,) is that of the eye if None; the object of the nodal ray lies `distance_mm` from the corneal apex.
-
-    Raises:
-        InputError: no nodal ray ends there.
+    Raises InputError if no nodal ray ends there.
     """
     wanted = eye.fovea_mm if fovea_mm is None else fovea_mm
 

@@ -48,13 +48,8 @@ def _through(eye: EyeModel, last: int) -> list[GradientMedium | None]:
 def nodal_rays(eye: EyeModel, objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats]:
     """Compute nodal rays from objects (m, 3): they reach the retina parallel to their direction in air.
 
-    The search starts at `guess_mm`.
-
-    Returns:
-        Directions (m, 3) and retina points (m, 3).
-
-    Raises:
-        InputError: an object has no such ray.
+    The search starts at `guess_mm`. Returns directions (m, 3) and retina points (m, 3). Raises InputError if an object
+    has no such ray.
     """
     found = parallel_rays(path_to_retina(eye), objects_mm, guess_mm)
     if found is None:
@@ -105,10 +100,8 @@ def fovea_by_nodal_ray(eye: EyeModel, node_mm: Floats, field_rad: Floats, distan
 def chief_ray_in_air(eye: EyeModel, fovea_mm: Floats) -> LineOfSight:
     """Compute the ray in air from the fovea through the stop's centre.
 
-    This ray is fixed in the eye, so fixation by chief ray only has to turn it onto the target.
-
-    Raises:
-        InputError: there is no such ray.
+    This ray is fixed in the eye, so fixation by chief ray only has to turn it onto the target. Raises InputError if
+    there is no such ray.
     """
     centre = eye.stop.centre_mm
     if eye.back:
@@ -166,14 +159,9 @@ def refraction_d(eye: EyeModel, *, vertex_mm: float = VERTEX_MM) -> tuple[float,
     """Compute the spectacle refraction (D) about the optic axis as a power vector: sphere equivalent M, J0, J45.
 
     The refraction in the meridian f, from nasal towards up, is M + J0 cos 2f + J45 sin 2f (Thibos, Wheeler and Horner
-    1997, Optom. Vis. Sci. 74, 367-375). Derivatives are central differences over 0.002 mm and 0.0001 rad.
-
-    Args:
-        eye: a single eye.
-        vertex_mm: distance of the spectacles from the cornea.
-
-    Raises:
-        InputError: a ray near the axis does not reach the retina.
+    1997, Optom. Vis. Sci. 74, 367-375). Derivatives are central differences over 0.002 mm and 0.0001 rad. `eye`: a
+    single eye; `vertex_mm`: distance of the spectacles from the cornea. Raises InputError if a ray near the axis does
+    not reach the retina.
     """
     path = path_to_retina(eye)
     steps = np.array([[_HEIGHT_MM, 0, 0, 0], [0, _HEIGHT_MM, 0, 0], [0, 0, _SLOPE, 0], [0, 0, 0, _SLOPE]])

@@ -171,12 +171,9 @@ def image_files(folder: str | Path) -> list[str]:
 def read_image(path: str | Path) -> tuple[NDArray[Any], int]:
     """Read a greyscale image and its bit depth (8 or 16).
 
-    Returns:
-        (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float).
-
-    Raises:
-        InputError: the file is missing, not regular, unreadable, empty or too large, or the image has real colour,
-            transparency or several frames.
+    Returns (h, w) uint8 or uint16, or float32 for a float TIFF; bit depth (32 for float). Raises InputError if the file
+    is missing, not regular, unreadable, empty or too large, or the image has real colour, transparency or several
+    frames.
     """
     image, depth, _ = _read(path, colour=False)
     return image, depth
@@ -191,11 +188,8 @@ def image_of(data: bytes, source: str) -> tuple[NDArray[Any], int]:
 def read_any_image(path: str | Path) -> tuple[NDArray[Any], int, bool]:
     """Read an image like `read_image`, but convert real colour to luminance (ITU-R BT.601).
 
-    Returns:
-        The image and its bit depth as of `read_image`, and whether it has colour.
-
-    Raises:
-        InputError: as `read_image`, except for colour.
+    Returns the image and its bit depth as of `read_image`, and whether it has colour. Raises InputError as
+    `read_image`, except for colour.
     """
     return _read(path, colour=True)
 

@@ -117,11 +117,8 @@ class ImageEntry:
     def file(self, key: str) -> Path | None:
         """Return the path of the file that one of `FILE_KEYS` names; None if the metadata names none.
 
-        A file in a tar is copied to a temporary one, which is removed when this process ends.
-
-        Raises:
-            InputError: the path leads out of the folder, or the file is missing or not regular (a link, a pipe, a
-                folder).
+        A file in a tar is copied to a temporary one, which is removed when this process ends. Raises InputError if the
+        path leads out of the folder, or the file is missing or not regular (a link, a pipe, a folder).
         """
         name = self.line.get(key)
         if name is None:
@@ -182,13 +179,8 @@ class ImageEntry:
     def mask(self) -> Bytes | None:
         """Read the class of each pixel, (h, w): 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 and 5 frames.
 
-        Class 4 frames the view, class 5 is the frame of spectacles.
-
-        Returns:
-            The mask; None if the metadata names none.
-
-        Raises:
-            InputError: as for `image`; the file does not have 8 bits.
+        Class 4 frames the view, class 5 is the frame of spectacles. Returns the mask; None if the metadata names none.
+        Raises InputError as for `image`, or if the file does not have 8 bits.
         """
         return self.pixels("mask_file_name")
 
@@ -215,11 +207,8 @@ class ImageEntry:
     def depth(self) -> Singles | None:
         """Read the depth (h, w), mm along the camera's axis to the first surface, NaN where there is none.
 
-        Returns:
-            The depth, None where the line names no such file.
-
-        Raises:
-            InputError: as for `file`; the file is no array of the window's size.
+        Returns the depth, None where the line names no such file. Raises InputError as for `file`; the file is no array
+        of the window's size.
         """
         return self.pixels("depth_file_name")
 

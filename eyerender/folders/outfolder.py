@@ -62,10 +62,8 @@ _STAGES = re.compile(rf"{re.escape(STAGE)}([0-9]+|[0-9]+-[0-9a-f]+)")
 def refuse_non_empty(path: str | Path, overwrite: bool) -> None:
     """Check that an output folder may be used.
 
-    With `overwrite`, a folder is refused if this package did not make it or if it contains anything else.
-
-    Raises:
-        InputError: the folder holds something that must not be replaced.
+    With `overwrite`, a folder is refused if this package did not make it or if it contains anything else. Raises
+    InputError if the folder holds something that must not be replaced.
     """
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -96,11 +94,8 @@ def clear(folder: Path, *, known: bool = False) -> None:
 
     dataset.json is removed first, so that a partial dataset does not look complete. The marker is removed last, so that
     an interrupted removal can be repeated. Nothing is removed if something else is found. `known` says that the folder
-    belongs to a run, even if its identifying files are damaged.
-
-    Raises:
-        InputError: as `refuse_non_empty` with `overwrite`.
-        OSError: something cannot be removed.
+    belongs to a run, even if its identifying files are damaged. Raises InputError as `refuse_non_empty` with
+    `overwrite`; OSError if something cannot be removed.
     """
     if known:
         _refuse_others(folder, _listed(folder) or set())
@@ -118,10 +113,8 @@ def staged(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
 
     `dataset.json` moves last, so a folder that has one is complete, even after a power cut: everything is synced before
     it moves. A folder that no other file identifies gets the marker. Remains of an earlier, killed run are removed.
-
-    Raises:
-        InputError: the folder is not empty, or another writer uses it.
-        EyerenderError: the disk is full or not writable; nothing is left behind.
+    Raises InputError if the folder is not empty, or another writer uses it; EyerenderError if the disk is full or not
+    writable; nothing is left behind.
     """
     final = Path(path)
     refuse_non_empty(final, overwrite)

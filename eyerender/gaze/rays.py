@@ -150,9 +150,7 @@ def targets_on_screen(observations: Observations, screen: ScreenPlane) -> Floats
     """Compute screen coordinates (n, 2) mm of the observations' targets; NaN without a target.
 
     A target off the plane is projected along the line from the eye, because that is where the eye looks through it.
-
-    Raises:
-        InputError: a target is off the plane, and its eye's position is unknown or the line misses the plane.
+    Raises InputError if a target is off the plane, and its eye's position is unknown or the line misses the plane.
     """
     index = observations.index
     targets = index.target_mm

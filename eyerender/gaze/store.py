@@ -58,10 +58,8 @@ def fit_estimator(
     """Calibrate an estimator on the records that are right, and summarise the result (schema eyerender/gaze-fit/3).
 
     Records are left out if the extractor is unsure of their pupil, or if pupil or glints lie far from where those of
-    the other targets put them (`screening.py`).
-
-    Raises:
-        InputError: there are no targets, a fixation does not exist, or the estimator cannot be calibrated.
+    the other targets put them (`screening.py`). Raises InputError if there are no targets, a fixation does not exist,
+    or the estimator cannot be calibrated.
     """
     index = observations.index
     rows = np.isfinite(index.target_mm).all(axis=1)
@@ -187,10 +185,7 @@ def load_calibration(path: str | Path, own: str | None = None) -> tuple[GazeEsti
     """Read a calibration file: the estimator, and the rig of the calibration (None if the file has none).
 
     The calibration of a user's own class is read only if `own` names that class as `module:Class`, because a file must
-    never cause code to be loaded.
-
-    Raises:
-        InputError: naming the file and the key.
+    never cause code to be loaded. Raises InputError, naming the file and the key.
     """
     source = str(path)
     data = read_json(path)

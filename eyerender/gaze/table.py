@@ -515,11 +515,8 @@ def read_targets(
 ) -> tuple[str, Floats, Floats]:
     """Read a table of targets.
 
-    Returns:
-        "frame" or "time", the frames or times (n,), and the targets (n, 3) mm, NaN where a row names none.
-
-    Raises:
-        InputError: naming the wrong lines and columns.
+    Returns "frame" or "time", the frames or times (n,), and the targets (n, 3) mm, NaN where a row names none. Raises
+    InputError, naming the wrong lines and columns.
     """
     table, named = _opened(path, columns, of_targets=True)
     if named.target is None:
@@ -544,10 +541,8 @@ def with_targets(
     """Give observations the targets of a table.
 
     A row of the table with a `frame` belongs to this frame. A row with a `time` holds until that of the next row; a row
-    without a target ends the one before. Equal targets are one fixation.
-
-    Raises:
-        InputError: the table is wrong, the observations have no times, or no row fits.
+    without a target ends the one before. Equal targets are one fixation. Raises InputError if the table is wrong, the
+    observations have no times, or no row fits.
     """
     kind, keys, target = read_targets(path, columns, rig)
     order = np.argsort(keys, kind="stable")

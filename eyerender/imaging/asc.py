@@ -46,12 +46,8 @@ class _Eye:
 def asc_text(trace: Trace, screen_px: tuple[int, int]) -> str:
     """Write a trace of one camera as EyeLink's text.
 
-    Args:
-        trace: the trace.
-        screen_px: width and height of the screen's picture.
-
-    Raises:
-        InputError: the scene has no screen, or several cameras see an eye.
+    `screen_px`: width and height of the screen's picture. Raises InputError if the scene has no screen, or several
+    cameras see an eye.
     """
     if trace.scene.rig.screen is None:
         raise InputError("is needed for a gaze in pixels", source=trace.scene.source, path="rig.screen")

@@ -55,10 +55,7 @@ class Recording(NamedTuple):
 def write_recording(root: Path, recording: Recording, eyes: Sequence[GazeSeries]) -> None:
     """Write the samples and events of a run.
 
-    Args:
-        root: the folder of the dataset.
-        recording: its numbers and task.
-        eyes: series of one eye, or of both.
+    `root`: the folder of the dataset; `recording`: its numbers and task; `eyes`: series of one eye, or of both.
     """
     folder = root / f"sub-{recording.subject:02d}" / "beh"
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,11 +90,7 @@ def write_dataset(root: Path, name: str, participants: Mapping[int, Mapping[str,
 
 
 def write_trace(root: Path, trace: Trace, screen_px: tuple[int, int]) -> None:
-    """Write a trace as a BIDS dataset of one participant.
-
-    Raises:
-        InputError: several cameras see an eye.
-    """
+    """Write a trace as a BIDS dataset of one participant. Raises InputError if several cameras see an eye."""
     eyes = [series for series, _ in gaze_series(trace, screen_px)]
     name = trace.scene.name
     write_recording(root, Recording(1, 1, name), eyes)

@@ -289,11 +289,7 @@ def focus_dpt(frames: RenderableFrames, row: int) -> float:
 
 
 def check_windows(scene: RenderableScene) -> None:
-    """Check that the eyes of a scene can be rendered.
-
-    Raises:
-        InputError: they cannot.
-    """
+    """Check that the eyes of a scene can be rendered. Raises InputError if they cannot."""
     if scene.spec.image.surfaces == "mesh":
         scene.refuse_spectacles("meshes of the eye are rendered")
     if scene.spec.image.purkinje:

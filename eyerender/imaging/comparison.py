@@ -238,11 +238,7 @@ def compare(
 
 
 def _common_rig(rig: RigLike | Sequence[RigLike], rows: Ints) -> RigLike:
-    """Return the rig of some rows.
-
-    Raises:
-        InputError: they have different rigs.
-    """
+    """Return the rig of some rows. Raises InputError if they have different rigs."""
     if not isinstance(rig, Sequence):
         return rig
     first: RigLike = rig[rows[0]]

@@ -24,11 +24,7 @@ SCREEN_PX = (1920, 1080)
 
 
 def check_screen(screen_px: tuple[int, int]) -> None:
-    """Check the width and height of a screen's picture.
-
-    Raises:
-        InputError: a side is not 1 to 65,536 pixels.
-    """
+    """Check the width and height of a screen's picture. Raises InputError if a side is not 1 to 65,536 pixels."""
     if min(screen_px) < 1 or max(screen_px) > 65536:
         raise InputError("must be 1 to 65536", source="--screen-px")
 

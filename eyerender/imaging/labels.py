@@ -297,11 +297,8 @@ def limbus_px(scene: RenderableScene, view: EyeInWindow | EyeImage, count: int) 
     The limbus is the circle of the front cornea whose radius is the limbus radius minus half the limbus' width, made
     lower by the look's `limbus_aspect`.
 
-    Under a rolling shutter each point is that of its own row's time.
-
-    Returns:
-        The projected curve, with the points that the cornea hides, and the reason why it is not visible as a whole
-        (None if it is).
+    Under a rolling shutter each point is that of its own row's time. Returns the projected curve, with the points that
+    the cornea hides, and the reason why it is not visible as a whole (None if it is).
     """
     pixels, reason = _limbus_now(scene, view, count)
     return _at_own_rows(scene, view, pixels, lambda one: _limbus_now(scene, one, count)[0]), reason

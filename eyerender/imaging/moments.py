@@ -34,11 +34,7 @@ def moments(
 ) -> tuple[SubFrames, ...]:
     """Return the moments of an exposure; empty if nothing moves and every row gets all of its light.
 
-    Args:
-        frames: the frames.
-        row: one of them.
-        middle: its job, in the middle of the exposure.
-        job_of: makes the job of a row of frames.
+    `row`: one of them; `middle`: its job, in the middle of the exposure; `job_of`: makes the job of a row of frames.
     """
     spec = frames.scene.spec
     if spec.motion is not None:

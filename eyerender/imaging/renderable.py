@@ -197,11 +197,7 @@ class RenderableSource(Protocol):
 
 
 def posed_frames(frames: RenderableFrames | RenderableSource) -> RenderableFrames:
-    """Return the frames of a scene, or the given frames.
-
-    Raises:
-        TypeError: the argument is neither.
-    """
+    """Return the frames of a scene, or the given frames. Raises TypeError if the argument is neither."""
     found = frames.frames() if isinstance(frames, RenderableSource) else frames
     if not isinstance(found, RenderableFrames):
         raise TypeError(f"give frames or a scene, not {type(frames).__name__}")

@@ -22,10 +22,7 @@ def graphs_of(*surfaces: Surface) -> Graphs | None:
     """Express surfaces as graphs over one plane; cached for the same objects.
 
     Graph surfaces must have parallel x axes. If these are the eye's x axis, the working frame is that of the eye, else
-    that of the first graph surface.
-
-    Returns:
-        The graphs; None if the surfaces have no common plane.
+    that of the first graph surface. Returns the graphs; None if the surfaces have no common plane.
     """
     ensure_compiled(RAYS)
     frame = next((surface for surface in surfaces if isinstance(surface, GraphSurface)), None)

@@ -31,10 +31,7 @@ def read_objects(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     """Read the objects of a file with their names, in the file's coordinates.
 
     They are named as in an OBJ (by its groups, if it has no objects), by the nodes of a GLB, and by the file's stem for
-    STL and PLY.
-
-    Raises:
-        InputError: the file is of another kind, too large, damaged, or holds no triangles.
+    STL and PLY. Raises InputError if the file is of another kind, too large, damaged, or holds no triangles.
     """
     import trimesh  # its import takes a quarter of a second, and few processes need it
 

@@ -19,10 +19,8 @@ _PARALLEL = 1e-13
 def parallel_rays(path: Sequence[Crossing], objects_mm: Floats, guess_mm: Floats) -> tuple[Floats, Floats] | None:
     """Compute rays from objects (m, 3) in air that arrive at the last surface parallel to their direction at the start.
 
-    They are first aimed at `guess_mm`.
-
-    Returns:
-        Directions (m, 3) at the start and points (m, 3) on the last surface; None if an object has no such ray.
+    They are first aimed at `guess_mm`. Returns directions (m, 3) at the start and points (m, 3) on the last surface;
+    None if an object has no such ray.
     """
     direction, error, last = _solved(path, objects_mm, normalize(guess_mm - objects_mm))
     for k in np.flatnonzero(~(error < _PARALLEL)):

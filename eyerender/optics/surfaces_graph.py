@@ -114,10 +114,8 @@ def distances(surface: GraphSurface, points: Floats, ways: Floats, far: Floats, 
     """Intersect rays with a single surface that is convex towards its local +x.
 
     The rays (n, 3) start on the side from which they cross, with unit directions, in (d.g < 0) or out. Hits from the
-    distances `far` (n,), mm, on do not matter.
-
-    Returns:
-        Distances (n,) of the hits, infinite for none and perhaps for those beyond `far`.
+    distances `far` (n,), mm, on do not matter. Returns distances (n,) of the hits, infinite for none and perhaps for
+    those beyond `far`.
     """
     start, way = (points - surface.origin_mm) @ surface.rotation, ways @ surface.rotation
     conics = np.stack(surface.likeness(), axis=-1)

@@ -59,10 +59,8 @@ def eye_file(
     """Return the eye file of a drawn eye, for an entrance pupil of `entrance_mm`.
 
     `eye` are its numbers by their names in the table, including those from `refraction.solve`. The lens is accommodated
-    by `accommodation_d`; `seed` selects the outline of the pupil.
-
-    Raises:
-        InputError: the eye is physically impossible: surfaces cross, or the stop lies outside the chamber.
+    by `accommodation_d`; `seed` selects the outline of the pupil. Raises InputError if the eye is physically
+    impossible: surfaces cross, or the stop lies outside the chamber.
     """
     drawn = _accommodated(name, tuple(sorted(eye.items())), _Table(table), age_years, accommodation_d, seed)
 

@@ -36,10 +36,8 @@ def nearest_correlation(matrix: Floats, *, smallest: float = SMALLEST, steps: in
     """Compute the nearest matrix (Frobenius norm) with a unit diagonal and no eigenvalue below `smallest`.
 
     Projections on the two convex sets alternate, with Dykstra's correction for the cone (Higham 2002, "Computing the
-    nearest correlation matrix", IMA J. Numer. Anal. 22, 329-343, algorithm 3.3).
-
-    Raises:
-        InputError: the matrix is not symmetric, or the iteration does not converge.
+    nearest correlation matrix", IMA J. Numer. Anal. 22, 329-343, algorithm 3.3). Raises InputError if the matrix is not
+    symmetric, or the iteration does not converge.
     """
     if matrix.ndim != 2 or not np.allclose(matrix, matrix.T, atol=1e-12):
         raise InputError("must be a symmetric matrix", path="correlations")

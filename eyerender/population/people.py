@@ -92,10 +92,8 @@ class PopulationSpec(Spec):
 
         A subject's numbers depend on (this population, seed, subject) alone. Besides the quantities of the table these
         are `entrance_pupil_mm`, at the table's luminance, and numbers that follow from the refraction: the cornea's
-        principal radii (`steep_mm`, `flat_mm`, ...) and the lens (`lens_c0`).
-
-        Raises:
-            InputError: n < 1, or hardly anybody meets the conditions.
+        principal radii (`steep_mm`, `flat_mm`, ...) and the lens (`lens_c0`). Raises InputError if n < 1, or hardly
+        anybody meets the conditions.
         """
         if n < 1:
             raise InputError(f"must be >= 1, not {n}", path="n")
@@ -151,10 +149,8 @@ class Person(Spec):
 
         A pupillometer lets each eye look into the distance and sees its entrance pupil from the front. So it measures
         the horizontal distance of the parallel lines of sight, which pass through the centres of the entrance pupils.
-        The value holds for a person who looks far away without glasses, in the table's light, at 850 nm.
-
-        Raises:
-            InputError: an eye is physically impossible.
+        The value holds for a person who looks far away without glasses, in the table's light, at 850 nm. Raises
+        InputError if an eye is physically impossible.
         """
         return _apex_distance_mm(self.to_json())
 

@@ -62,11 +62,7 @@ class People:
         return len(self.number)
 
     def __getitem__(self, name: str) -> Floats:
-        """Return one quantity, (n,) or (n, 2).
-
-        Raises:
-            InputError: there is no such quantity.
-        """
+        """Return one quantity, (n,) or (n, 2). Raises InputError if there is no such quantity."""
         if name not in self.values:
             raise InputError(f"no such quantity; there are {', '.join(self.values)}", path=name)
         return self.values[name]
@@ -80,9 +76,7 @@ class People:
     def subject(self, row: int, **fields: Any) -> Subject:
         """Create the subject of a scene from a row, with lids, a face, and a separate eye for each side.
 
-        Args:
-            row: the row.
-            fields: further fields of `Subject`: `eyes`, `luminance_cd_m2`, `accommodation_d`, ...
+        `fields`: further fields of `Subject`: `eyes`, `luminance_cd_m2`, `accommodation_d`, ...
         """
         return Subject.of(self.person(row), **fields)
 

@@ -63,11 +63,7 @@ class Answers:
         return self._known.get((extractor, row))
 
     def put(self, extractor: str, row: int, answer: tuple[str, str, float]) -> None:
-        """Store an answer; the file is begun with the first one.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+        """Store an answer; the file is begun with the first one. Raises OSError if the file cannot be written."""
         if self._path is None:
             return
         with self._lock:
@@ -97,11 +93,8 @@ def task_of(extractors: Sequence[ExtractorCommand], code: Sequence[str], keys: S
 def code_digest(extractor: ExtractorCommand, timeout_s: float) -> str:
     """Compute the SHA-256 of an extractor's code; a `module:callable` or network is loaded, in a separate process.
 
-    Returns:
-        The digest; "" if its process failed for another reason, which the benchmark then reports.
-
-    Raises:
-        InputError: there is no such module or callable, or the network cannot be used.
+    Returns the digest; "" if its process failed for another reason, which the benchmark then reports. Raises InputError
+    if there is no such module or callable, or the network cannot be used.
     """
     argv = extractor.argv
     if argv[2:4] != ("-m", WORKER) or not (is_reference(argv[4]) or argv[4].startswith(PREFIX)):

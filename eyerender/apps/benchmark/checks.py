@@ -84,10 +84,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
 def compare_with(old: dict[str, Any], new: dict[str, Any], source: str) -> list[dict[str, Any]]:
     """Compare extractors with themselves in an earlier benchmark, on the images that both have in common.
 
-    An image counts as a success if its pupil is right, or if it shows no pupil and none is reported.
-
-    Raises:
-        InputError: the benchmarks have no image in common.
+    An image counts as a success if its pupil is right, or if it shows no pupil and none is reported. Raises InputError
+    if the benchmarks have no image in common.
     """
     digests = old["image_digests"]
     shared = {name for name, digest in new["image_digests"].items() if digests.get(name) == digest}

@@ -40,11 +40,7 @@ class FolderHints(Spec):
 
     @classmethod
     def load(cls, folder: Path) -> FolderHints:
-        """Read hints.json of a folder; without the file, nothing is known.
-
-        Raises:
-            InputError: naming the wrong key.
-        """
+        """Read hints.json of a folder; without the file, nothing is known. Raises InputError, naming the wrong key."""
         path = folder / HINTS
         if not path.exists():
             return cls()

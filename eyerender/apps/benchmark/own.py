@@ -154,10 +154,7 @@ def ellipse_of_mask(mask: Bools, source: str = "") -> Ellipse | None:
 
     The ellipse has the mask's second moments (each pixel is a square). If its overlap with the mask is worse than the
     pixel grid explains, a part of the pupil is hidden. Then the ellipse is fitted to the mask's contour, and points
-    count less the farther they lie inside the fit.
-
-    Raises:
-        InputError: too few pixels are marked.
+    count less the farther they lie inside the fit. Raises InputError if too few pixels are marked.
     """
     y, x = np.nonzero(mask)
     if x.size == 0:

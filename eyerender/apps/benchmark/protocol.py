@@ -124,9 +124,7 @@ class Extractor(Protocol):
     def __call__(self, image: Image, request: Mapping[str, Any], /) -> Mapping[str, Any]:
         """Extract features from an image: `{"pupil": {..}, "glints": [..]}`, as in the protocol above.
 
-        Args:
-            image: (h, w) values as stored in the file.
-            request: the request above, with `bit_depth` and `hints`.
+        `image`: (h, w) values as stored in the file; `request`: the request above, with `bit_depth` and `hints`.
         """
         ...
 
@@ -144,11 +142,7 @@ class Greeting:
 
     @classmethod
     def parse(cls, line: str) -> Greeting:
-        """Parse a line.
-
-        Raises:
-            InputError: the line is wrong; the message says why.
-        """
+        """Parse a line. Raises InputError if the line is wrong; the message says why."""
         data = _object(line)
         if data.get("schema") != SCHEMA:
             raise InputError(f"is {data.get('schema')!r}; this version speaks {SCHEMA!r}", path="schema")
@@ -191,11 +185,7 @@ class Reply:
 
     @classmethod
     def parse(cls, line: str, request_id: int, conventions: Conventions) -> Reply:
-        """Parse a line.
-
-        Raises:
-            InputError: the line is wrong; the message says why.
-        """
+        """Parse a line. Raises InputError if the line is wrong; the message says why."""
         data = _object(line)
         if data.get("id") != request_id:
             raise InputError(f"must be {request_id}, not {shown(data.get('id'))}", path="id")

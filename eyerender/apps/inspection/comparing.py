@@ -73,11 +73,8 @@ def distance_and_chance(first: tuple[Floats, Ints], second: tuple[Floats, Ints])
 
     With independent numbers, chance is 1.36 sqrt((n + m) / (n m)). Where units have several numbers, the units are also
     dealt to the two datasets at random, and chance is the 95th percentile of the distances if that is larger. It is
-    smaller where draws of a dataset are spread evenly (Sobol, grids).
-
-    Args:
-        first: numbers (n,), and the unit of each (n,), counted from 0.
-        second: those of the other dataset.
+    smaller where draws of a dataset are spread evenly (Sobol, grids). `first`: numbers (n,), and the unit of each (n,),
+    counted from 0; `second`: those of the other dataset.
     """
     sizes = [int(units.max()) + 1 for _, units in (first, second)]
     counts = len(first[0]), len(second[0])

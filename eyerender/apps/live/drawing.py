@@ -80,10 +80,8 @@ class Strokes:
 def strokes(frames: Frames, truth: Observations, row: int) -> Strokes:
     """Draw the rig of a scene, its eyes in their poses, and the rays of one frame's eye, as line segments.
 
-    Args:
-        frames: the frames of one fixation: a row for each camera and eye.
-        truth: observations of the analytic observer for these frames.
-        row: the row whose rays are drawn.
+    `frames`: the frames of one fixation: a row for each camera and eye; `truth`: observations of the analytic observer
+    for these frames; `row`: the row whose rays are drawn.
     """
     out, scene = Strokes(), frames.scene
     shown = int(frames.index.camera[row])

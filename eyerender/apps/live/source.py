@@ -17,10 +17,8 @@ _SCENE_KEYS = ("format", "name", "eye", "subject", "rig")
 def python_source(spec: SceneSpec) -> str:
     """Return a scene as Python source.
 
-    Values that equal their defaults are omitted. The script defines `scene`, and prints it as YAML when run.
-
-    Args:
-        spec: the content of a scene file.
+    Values that equal their defaults are omitted. The script defines `scene`, and prints it as YAML when run. `spec`:
+    the content of a scene file.
     """
     subject = _call("er.Subject", [_value(spec.eye, 1)], _fields(spec.subject, 0), 0)
     rest = [f"name={_value(spec.name, 0)}", *(text for key, text in _pairs(spec, 0) if key not in _SCENE_KEYS)]

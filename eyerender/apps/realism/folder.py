@@ -37,9 +37,7 @@ _SIDE = 6  # number of steps on either side of a radius over which levels are av
 def iris_extent(level: Singles, pupil: Ellipse) -> tuple[float, float] | None:
     """Return the centre and half width (px) of the iris' horizontal extent; None if no limbus is found on both sides.
 
-    Args:
-        level: (h, w) linear levels.
-        pupil: outline of the pupil.
+    `level`: (h, w) linear levels; `pupil`: outline of the pupil.
     """
     a, b = pupil.semi_axes_px
     inner = float(np.sqrt(a * b))
@@ -181,9 +179,7 @@ def _spread(count: int, limit: int) -> list[int]:
 def pictures(source: PictureFolder, gamma: float) -> Iterator[EyePicture | Skipped]:
     """Yield each image of a source with its landmarks, or the reason why it cannot be measured.
 
-    Args:
-        source: the folder.
-        gamma: the images store intensity^(1 / gamma).
+    `source`: the folder; `gamma`: the images store intensity^(1 / gamma).
     """
     for k, name in enumerate(source.names):
         try:

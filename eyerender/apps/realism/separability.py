@@ -45,12 +45,8 @@ _CELLS = {(_SIDE_PX, _SIDE_PX): (2, 2), _EYE_PX: (4, 6)}  # cells in which direc
 def patches(s: Scaled, seed: int) -> dict[str, tuple[Bytes, ...]]:
     """Cut patches of every kind from a picture; patches that are not wholly inside are omitted.
 
-    Args:
-        s: the picture, with R at 50 px.
-        seed: seed of the noise.
-
-    Returns:
-        Kind -> patches, (20, 20) each, and (64, 100) for the whole eye.
+    `s`: the picture, with R at 50 px; `seed`: seed of the noise. Returns kind -> patches, (20, 20) each, and (64, 100)
+    for the whole eye.
     """
     codes = _equalised(s, seed)
     x, y = (np.asarray(s.centre) / _STEP).tolist()

@@ -119,10 +119,8 @@ def directions_deg() -> Floats:
 def direction_errors_deg(seen: Observations, rig: RigGeometry, name: str) -> Floats:
     """Compute errors (25, 2) of estimated directions, to the right and up, deg; NaN for calibration and failures.
 
-    Args:
-        seen: observations of the 25 directions.
-        rig: the rig that observed them.
-        name: the feature, one of `FEATURES`.
+    `seen`: observations of the 25 directions; `rig`: the rig that observed them; `name`: the feature, one of
+    `FEATURES`.
     """
     learnt = calibration_rows()
     truth = direction_of(*np.radians(directions_deg()).T)

@@ -129,11 +129,8 @@ def make_images(
     """Return the images of all shots' scenes from the folder's dataset; make the missing ones.
 
     The folder belongs to the study: a dataset of other settings or of another version of the package is replaced. With
-    `options.auto_exposure`, each eye model has its own exposure (see `DatasetSpec`).
-
-    Raises:
-        BackendError: no backend can render.
-        EyerenderError: the disk is full, or a worker died repeatedly.
+    `options.auto_exposure`, each eye model has its own exposure (see `DatasetSpec`). Raises BackendError if no backend
+    can render; EyerenderError if the disk is full, or a worker died repeatedly.
     """
     from ...dataset.plan import Plan
     from ...dataset.run import generate

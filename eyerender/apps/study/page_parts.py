@@ -44,10 +44,7 @@ def cards_of(cells: Mapping[tuple[str, str], Mapping[str, str]], what: str) -> l
 def budget_section(made_of: Sequence[Budget], shown: Sequence[str], who: str) -> Section | None:
     """Say what the gaze error is made of; None for a single term.
 
-    Args:
-        made_of: the error budgets.
-        shown: the estimators drawn.
-        who: the algorithm in words.
+    `made_of`: the error budgets; `shown`: the estimators drawn; `who`: the algorithm in words.
     """
     if not any(len(b.terms) > 1 for b in made_of):
         return None

@@ -127,9 +127,7 @@ def _digest(spec: SweepSpec, scene: Scene) -> str:
 def _claim(folder: Path, settings: Mapping[str, Any], overwrite: bool) -> None:
     """Create the folder for this sweep, or check that it belongs to it.
 
-    Raises:
-        InputError: the folder holds something else.
-        EyerenderError: the folder cannot be written.
+    Raises InputError if the folder holds something else; EyerenderError if the folder cannot be written.
     """
     marker = folder / MARKER
     try:
@@ -288,11 +286,7 @@ _KEYS = {
 
 
 def _read(path: Path, number: int) -> dict[str, Any]:
-    """Read the result of a layout.
-
-    Raises:
-        InputError: this package did not write the file.
-    """
+    """Read the result of a layout. Raises InputError if this package did not write the file."""
     row = read_json(path, follow=False)
     if row.get("schema") != LAYOUT_SCHEMA or row.get("number") != number or not row.keys() >= _KEYS:
         raise InputError(f"is not the result of layout {number}; remove it", source=str(path))

@@ -145,11 +145,7 @@ class RigLayout:
 
 
 def layouts_of(spec: SweepSpec, scene: Scene) -> list[RigLayout]:
-    """Return all layouts of a sweep, each validated.
-
-    Raises:
-        InputError: naming the key that does not fit the scene.
-    """
+    """Return all layouts of a sweep, each validated. Raises InputError, naming the key that does not fit the scene."""
     axes = list(_axes(spec.sweep, scene))
     total = int(np.prod([len(values) for _, values in axes], dtype=float))
     if total > MAX_LAYOUTS:

@@ -53,11 +53,8 @@ def cache_folder() -> Path | None:
 def private_folder(path: Path) -> Path | None:
     """Create a folder if it is missing, and make sure that nobody else can write to it.
 
-    Args:
-        path: an absolute path.
-
-    Returns:
-        The path. None if the folder cannot be created and, with one warning on stderr, if it is not safe.
+    `path`: an absolute path. Returns the path; None if the folder cannot be created and, with one warning on stderr, if
+    it is not safe.
     """
     try:
         if hasattr(os, "geteuid"):

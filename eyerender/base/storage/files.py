@@ -85,10 +85,8 @@ def written(path: str | Path, *, sync: bool = True, ending: str = PART) -> Itera
 def refuse_special(path: str | Path) -> None:
     """Check that a file may be written, so that no device is harmed and no pipe blocks.
 
-    A link may be replaced unless it leads to something other than a file.
-
-    Raises:
-        InputError: the path is an address, a folder, a pipe, a device or a socket, or lies in a folder of devices.
+    A link may be replaced unless it leads to something other than a file. Raises InputError if the path is an address,
+    a folder, a pipe, a device or a socket, or lies in a folder of devices.
     """
     refuse_address(path)
     path = Path(path)
@@ -149,9 +147,7 @@ def sync_folder(path: str | Path) -> None:
     """Make the file names in a folder durable.
 
     Does nothing if folders cannot be opened (Windows) or the file system cannot sync them (some network file systems).
-
-    Raises:
-        OSError: the folder cannot be synced.
+    Raises OSError if the folder cannot be synced.
     """
     if hasattr(os, "O_DIRECTORY"):
         try:
@@ -164,9 +160,7 @@ def sync_folder(path: str | Path) -> None:
 def make_folder(path: str | Path) -> bool:
     """Create a folder and its missing parents, durably; return whether it is new.
 
-    Raises:
-        InputError: the path is an address.
-        OSError: the folder cannot be created.
+    Raises InputError if the path is an address; OSError if the folder cannot be created.
     """
     refuse_address(path)
     path = Path(path)
@@ -236,10 +230,7 @@ def sync_tree(path: str | Path) -> None:
     """Make a folder durable with everything in it; links are not followed.
 
     Several threads sync files, because a file system writes one journal entry for all waiting threads: 0.4 ms per file
-    instead of 4 on ext4.
-
-    Raises:
-        OSError: a file cannot be synced.
+    instead of 4 on ext4. Raises OSError if a file cannot be synced.
     """
     with ThreadPoolExecutor(8) as threads:
         for place, _, names in os.walk(path, topdown=False):
@@ -256,13 +247,8 @@ def sync_tree(path: str | Path) -> None:
 def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True) -> Iterator[BufferedReader]:
     """Open a regular file for reading.
 
-    Args:
-        path: the file.
-        limit: largest accepted size in bytes.
-        follow: whether the file may be a symbolic link.
-
-    Raises:
-        InputError: the file is missing, not regular (a pipe, a device, a folder), too large, or not readable.
+    `path`: the file; `limit`: largest accepted size in bytes; `follow`: whether the file may be a symbolic link. Raises
+    InputError if the file is missing, not regular (a pipe, a device, a folder), too large, or not readable.
     """
     handle, state = _regular(path, os.O_RDONLY, follow)
     size = state.st_size
@@ -275,13 +261,8 @@ def opened(path: str | Path, *, limit: int = MAX_FILE_BYTES, follow: bool = True
 def read_slice(path: str | Path, start: int, length: int) -> tuple[bytes, os.stat_result]:
     """Read `length` bytes of a regular file, not a link, from `start` on; fewer beyond its end.
 
-    One slice takes half the system calls of `opened`, on which reading small pictures spends much of its time.
-
-    Returns:
-        The bytes, and the state of the file.
-
-    Raises:
-        InputError: as for `opened`.
+    One slice takes half the system calls of `opened`, on which reading small pictures spends much of its time. Returns
+    the bytes, and the state of the file. Raises InputError as for `opened`.
     """
     handle, state = _regular(path, os.O_RDONLY, follow=False)
     try:
@@ -295,9 +276,7 @@ def read_slice(path: str | Path, start: int, length: int) -> tuple[bytes, os.sta
 def appended(path: str | Path) -> BufferedRandom:
     """Open a regular file, which is not a link, for appending and reading; create it if it is missing.
 
-    Raises:
-        InputError: the path is a link, or something else than a file.
-        OSError: the disk is full or not writable.
+    Raises InputError if the path is a link, or something else than a file; OSError if the disk is full or not writable.
     """
     return open(_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False)[0], "ab+")
 
@@ -422,9 +401,7 @@ def inside(folder: Path, name: object, *, source: str = "", path: str = "") -> P
     """Resolve the path of the regular file `name` in a folder that is not trusted.
 
     The name must be relative, with plain parts (no `..`, no control characters), and no part of it may be a link.
-
-    Raises:
-        InputError: the name leads out of the folder, or is not a regular file in it.
+    Raises InputError if the name leads out of the folder, or is not a regular file in it.
     """
     if not is_plain(name):
         raise InputError(f"must be a path inside the folder, not {shown(name)}", source=source, path=path)

@@ -32,12 +32,8 @@ class JsonLines:
     def index(cls, path: Path, *, limit: int = MAX_LINE_BYTES) -> JsonLines:
         """Index the lines of a file in one pass, with 8 bytes of memory per line.
 
-        Args:
-            path: a regular file, not a link.
-            limit: longest accepted line, in bytes.
-
-        Raises:
-            InputError: the file cannot be read, or one of its lines is too long or blank.
+        `path`: a regular file, not a link; `limit`: longest accepted line, in bytes. Raises InputError if the file
+        cannot be read, or one of its lines is too long or blank.
         """
         parts = [np.zeros(1, dtype=np.int64)]
         count = start = offset = 0  # number of complete lines, start of the current one, bytes read
@@ -125,10 +121,7 @@ class LineFiles:
         """Read some lines, counted from 0 over all files: the file, the line's number in it, the object.
 
         `rows` may have any step; lines in increasing order are read fastest. Line numbers count from 1. `before` is as
-        for `JsonLines.read`.
-
-        Raises:
-            InputError: as `JsonLines.read`.
+        for `JsonLines.read`. Raises InputError as `JsonLines.read`.
         """
         at = 0
         while at < len(rows):

@@ -32,9 +32,7 @@ _UNSUPPORTED = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
 def writer_lock(folder: Path, warn: Say = lambda _text: None) -> Iterator[None]:
     """Hold a whole folder during the block; the lock file is removed afterwards.
 
-    Raises:
-        InputError: another writer holds the folder.
-        EyerenderError: the folder cannot be written.
+    Raises InputError if another writer holds the folder; EyerenderError if the folder cannot be written.
     """
     with contextlib.ExitStack() as stack:
         _take(stack, folder / LOCK, shared=False, folder=folder, warn=warn)

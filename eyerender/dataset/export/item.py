@@ -83,14 +83,8 @@ class Item:
     def encode(self, key: str = "file_name") -> bytes | None:
         """Return one of the image's files as it stands in the export: counts are encoded, others are unchanged.
 
-        Args:
-            key: one of `FILE_KEYS`.
-
-        Returns:
-            The bytes of the file; None if the metadata names no such image.
-
-        Raises:
-            InputError: the file cannot be read.
+        `key`: one of `FILE_KEYS`. Returns the bytes of the file; None if the metadata names no such image. Raises
+        InputError if the file cannot be read.
         """
         data = self.entry.data(key)
         is_kept = key not in _COUNTS or self.encoding.keeps(self.bit_depth, self.entry.gamma)

@@ -155,10 +155,8 @@ def part_of(part: str, line: Mapping[str, Any], picture: PixelsOf, *, linear: bo
     """Read one of `PARTS` of a picture from its line (`eyerender/image/5`) and its pixels by kind of picture.
 
     `linear` undoes the camera's gamma; `lights` is the number of rows of `glints`, by default that of the rig's lamps.
-
-    Raises:
-        KeyError: there is no such picture, or the line lacks a key.
-        InputError: the rig has more lamps than `lights`.
+    Raises KeyError if there is no such picture, or the line lacks a key; InputError if the rig has more lamps than
+    `lights`.
     """
     if part in ("image", "noiseless"):
         gamma = float(line.get("gamma") or 1.0) if linear else 1.0

@@ -59,10 +59,7 @@ class Preparation:
     def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:
         """Read an item from its line (`eyerender/image/5`; `where` in messages) and its pixels by kind of picture.
 
-        Left eyes are mirrored if asked for.
-
-        Raises:
-            InputError: a picture or a label is missing or wrong.
+        Left eyes are mirrored if asked for. Raises InputError if a picture or a label is missing or wrong.
         """
         parts: dict[str, Any] = {}
         part, linear, lights = "visible_fraction", self.encoding == "linear", self.lights

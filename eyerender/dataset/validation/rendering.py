@@ -31,14 +31,9 @@ def render_again(
 ) -> list[str]:
     """Render the samples of some rows of a dataset again.
 
-    Differences are problems if the same versions, backend and kind of processor made the images.
-
-    Returns:
-        Notes: the number of images, and differences from images of another maker with how the makers differ.
-
-    Raises:
-        BackendError: no backend can render.
-        InputError: a file of the plan is missing, or a picture cannot be read.
+    Differences are problems if the same versions, backend and kind of processor made the images. Returns notes: the
+    number of images, and differences from images of another maker with how the makers differ. Raises BackendError if no
+    backend can render; InputError if a file of the plan is missing, or a picture cannot be read.
     """
     entries: dict[int, list[ImageEntry]] = {}
     for row in rows:

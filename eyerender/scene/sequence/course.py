@@ -65,11 +65,7 @@ class MovingEyes:
 
     @classmethod
     def of(cls, sequence: Sequence, aim: Aiming, habits: Habits, resting_mm: Floats) -> MovingEyes:
-        """Make a sequence's courses on the grid.
-
-        Raises:
-            InputError: an eye cannot look at a target.
-        """
+        """Make a sequence's courses on the grid. Raises InputError if an eye cannot look at a target."""
         sequence = sequence.resolved()
         count = round((sequence.duration_s + 2 * BEFORE_S) / STEP_S) + 2
         times = np.asarray(STEP_S * np.arange(count) - BEFORE_S, dtype=np.float64)

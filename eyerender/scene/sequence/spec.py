@@ -319,11 +319,7 @@ class Timestamps(Spec):
         return self
 
     def resolved(self, base: Path | None = None) -> Self:
-        """Return it with its file read in.
-
-        Raises:
-            InputError: the file cannot be read, or its times do not rise.
-        """
+        """Return it with its file read in. Raises InputError if the file cannot be read, or its times do not rise."""
         if self.file is None:
             return self
         path = (base or Path()) / self.file
