@@ -26,7 +26,7 @@ from ..population.statistics import Moments, PopulationStatistics, Refusals, pie
 from ..population.table import PopulationTable, Source, default_table
 from ..report.overlay import picture
 from ..report.page import Card, Content, Figure, Page, Section, Table, write_page
-from ..report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
+from ..report.style import ANALYTIC, IMAGE, figure, svg
 from ..scene import Scene
 from ..scene.people import Population
 from ..scene.spec import SceneSpec
@@ -298,7 +298,10 @@ def _matrix(s: PopulationStatistics) -> str:
     at = [s.names.index(name) for name in names]
     r = s.correlation[np.ix_(at, at)]
     with figure(8.4, 7.2) as (fig, ax):
-        correlation_map(ax, r, names)
+        ax.imshow(r, cmap="RdBu_r", vmin=-1, vmax=1)
+        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+        ax.set_yticks(range(len(names)), names, fontsize=8)
+        ax.grid(visible=False)
         for i, j in np.ndindex(r.shape):
             colour = "white" if abs(r[i, j]) > 0.6 else "black"
             ax.text(j, i, f"{r[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)

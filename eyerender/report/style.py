@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -88,14 +88,6 @@ def error_panel(ax: Any, vectors: Floats, title: str, colour: str, marker: str =
     ax.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", title=f"{title} (n = {len(good)})")
     ax.set(xlabel="x (px)", ylabel="y (px, down)")
     ax.locator_params(nbins=4)
-
-
-def correlation_map(ax: Any, values: Floats, names: Sequence[str]) -> Any:
-    """Draw a matrix of correlations with the names of its rows and columns; return the image, for a colour bar."""
-    ax.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-    ax.set_yticks(range(len(names)), names, fontsize=8)
-    ax.grid(visible=False)
-    return ax.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
 
 
 def svg(fig: Any) -> str:

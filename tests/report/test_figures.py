@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from matplotlib.colors import to_rgba
 import eyerender as er
 from eyerender.apps import survey as surveys
 from eyerender.apps.benchmark import page as bench
-from eyerender.apps.inspection import page as inspection
 from eyerender.apps.realism import page as realism
 from eyerender.apps.realism.figures import FIGURES
 from eyerender.apps.realism.folder import FolderFigures
@@ -179,7 +177,7 @@ def kept(monkeypatch):
         figures.append(fig)
         return style.svg(fig)
 
-    for module in (surveys, bench, inspection, realism, study, observer_figures, rigs_page, sweeps, comparison):
+    for module in (surveys, bench, realism, study, observer_figures, rigs_page, sweeps, comparison):
         monkeypatch.setattr(module, "svg", keep)
     return figures
 
@@ -296,15 +294,6 @@ def case_histograms(kept):
     assert [float(t.get_text()) for t in ax.texts] == pytest.approx(
         found.correlation[np.ix_(at, at)].ravel(), abs=0.006
     )
-
-
-def case_correlations(kept):
-    matrix = np.array([[1, 0.5, -0.2], [0.5, 1, 0.1], [-0.2, 0.1, 1]])
-    found: Any = SimpleNamespace(correlated=(["a", "b", "c"], matrix))
-    inspection._correlation_figure(found)
-    ax = kept[0].axes[0]
-    np.testing.assert_allclose(ax.images[0].get_array(), matrix)
-    assert [t.get_text() for t in ax.get_xticklabels()] == ["a", "b", "c"]
 
 
 def case_realism(kept):

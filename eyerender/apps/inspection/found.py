@@ -9,17 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import Floats
 from .dependence import Dependence
 from .duplicates import SimilarPair
 from .faults import KINDS
 from .missing import MissingLabels
 from .outliers import Outlier, WorstPicture
 from .reading import Contents
-from .statistics import Distribution, strongest
+from .statistics import Distribution
 
 _LISTED = 100  # images of each kind of fault in the JSON
-_PAIRS = 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,16 +32,10 @@ class Inspection:
     outliers: list[Outlier]  # the most unusual images
     worst: list[WorstPicture]  # the worst pictures by simple figures
     distributions: dict[str, Distribution]  # of each column
-    correlated: tuple[list[str], Floats]  # names of the columns that vary, and (m, m) their rank correlations
     missing: list[MissingLabels]  # labels that more than 2 % of the images lack
     shares: dict[str, dict[str, float]]  # of the images, in ranges of what matters to training
     # pairs of draws and labels that depend on each other; None if there are too few subjects to test
     dependences: list[Dependence] | None
-
-    @property
-    def strongest(self) -> list[tuple[str, str, float]]:
-        """The strongest correlations."""
-        return strongest(*self.correlated, _PAIRS)
 
     def faults(self) -> dict[str, list[tuple[int, str]]]:
         """Places and details of the faults of each kind, in the order of `KINDS`."""
@@ -79,7 +71,6 @@ class Inspection:
             "shares": self.shares,
             "missing": [one._asdict() for one in self.missing],
             "dependences": None if self.dependences is None else [one._asdict() for one in self.dependences],
-            "correlations": [list(pair) for pair in self.strongest],
         }
 
     def _listed(self, found: Sequence[tuple[int, str]]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from .missing import missing_labels
 from .outliers import outliers, worst_pictures
 from .planned import dependences_of, draw_plan
 from .reading import Contents, matrix, read, split_of_subjects
-from .statistics import distribution, rank_correlations
+from .statistics import distribution
 from .strata import shares_of
 
 SCHEMA = "eyerender/inspection/1"
@@ -110,7 +110,6 @@ def examine(contents: Contents) -> Inspection:
         outliers=outliers(values, varying),
         worst=worst_pictures(contents),
         distributions=distributions,
-        correlated=(varying, rank_correlations(values)),
         missing=missing_labels(contents),
         shares=shares_of(contents),
         dependences=dependences_of(contents),

@@ -1,4 +1,4 @@
-"""The page of an inspection: faults, outliers, duplicates, splits, strata, distributions, correlations, differences."""
+"""The page of an inspection: faults, outliers, duplicates, splits, strata, distributions, differences."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ...base.errors import WRONG, InputError
 from ...dataset.export.encoding import Encoding, measured_gain
 from ...folders.imagefolder import FILE_KEYS, ImageEntry
 from ...report.overlay import picture
-from ...report.page import Card, Content, Figure, Gallery, Key, Page, Section, Table, write_page
-from ...report.style import ANALYTIC, IMAGE, correlation_map, figure, svg
+from ...report.page import Card, Content, Gallery, Key, Page, Section, Table, write_page
+from ...report.style import ANALYTIC, IMAGE
 from .comparing import Shift, only_in, shares
 from .dependence import SUBJECTS, Dependence
 from .faults import KINDS
@@ -30,7 +30,7 @@ from .strata import strata
 
 _WIDTH = 260  # of pictures on the page, px
 _SAMPLED = 64  # pictures from which the gain is measured
-_FAULTS, _PAIRS, _SHIFTS, _CORRELATED, _NAMED = 24, 8, 16, 36, 40
+_FAULTS, _PAIRS, _SHIFTS, _NAMED = 24, 8, 16, 40
 _SMALL_REM, _HISTOGRAM_REM = 5.9, 9.4
 _WHERE = {LABEL: "Labels", PICTURE: "Pictures", DRAW: "Draws", PERSON: "People"}
 _MARKS = {"pupil": "#ff9f1c", "iris": "#56b4e9", "glints": "#7fdd4c"}
@@ -198,7 +198,6 @@ def _dataset(found: Inspection, before: str) -> list[Section]:
             for part in parts
         ],
         "Distributions": _distributions(found.distributions),
-        "Correlations": _correlations(found),
     }
     return [Section(before + heading, *content) for heading, content in sections.items()]
 
@@ -369,31 +368,6 @@ def _bars(name: str, parts: Sequence[Ints], colours: Sequence[str]) -> str:
         '<svg viewBox="0 0 100 40" preserveAspectRatio="none" role="img" xmlns="http://www.w3.org/2000/svg">'
         f"<title>histogram of {html.escape(name)}</title>{''.join(paths)}</svg>"
     )
-
-
-def _correlations(found: Inspection) -> list[Content]:
-    drawn = _correlation_figure(found)
-    if drawn is None:
-        return ["Fewer than two numbers vary."]
-    rows = [(a, b, f"{rho:+.2f}") for a, b, rho in found.strongest]
-    return [
-        Figure(drawn, "Spearman's rank correlations of the numbers that depend most on others."),
-        Table(("number", "number", "correlation"), rows, "The strongest correlations", wide=(0, 1), folded=True),
-    ]
-
-
-def _correlation_figure(found: Inspection) -> str | None:
-    """Draw the rank correlations of the columns that depend most on others."""
-    names, matrix = found.correlated
-    if len(names) < 2:
-        return None
-    others = np.abs(np.nan_to_num(matrix)) - np.eye(len(names))
-    chosen = np.sort(np.argsort(-others.max(axis=1), kind="stable")[:_CORRELATED])
-    size = 3.4 + 0.19 * len(chosen)
-    with figure(size + 2.2, size) as (fig, ax):
-        drawn = correlation_map(ax, matrix[np.ix_(chosen, chosen)], [names[k] for k in chosen])
-        fig.colorbar(drawn, ax=ax, shrink=0.5, label="rank correlation")
-        return svg(fig)
 
 
 def _difference(first: Inspection, second: Inspection, moved: Sequence[Shift]) -> Section:

@@ -66,11 +66,3 @@ def rank_correlations(values: Reals) -> Floats:
     squares = (ranks**2).T @ there.astype(float)  # of a column, over the rows that another one has
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.clip((ranks.T @ ranks) / np.sqrt(squares * squares.T), -1.0, 1.0))
-
-
-def strongest(names: list[str], correlations: Floats, count: int) -> list[tuple[str, str, float]]:
-    """Pairs of columns with the strongest correlations."""
-    a, b = np.triu_indices(len(names), 1)
-    found = np.nan_to_num(correlations[a, b])
-    order = np.argsort(-np.abs(found), kind="stable")[:count]
-    return [(names[a[k]], names[b[k]], float(found[k])) for k in order]
