@@ -116,25 +116,16 @@ class SurveySize:
 
 
 def run_survey(
-    population: PopulationSpec,
-    output: str | Path,
-    size: SurveySize = SurveySize(),
+    population: PopulationSpec,  # the people
+    output: str | Path,  # the folder
+    size: SurveySize = SurveySize(),  # how many people, and the seed
     *,
-    backend: BackendChoice = "auto",
-    threads: int | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    backend: BackendChoice = "auto",  # the render backend
+    threads: int | None = None,  # total number of processor threads; by default all
+    overwrite: bool = False,  # replace the contents of the folder
+    progress: Progress | None = None,  # called with (steps done, steps in all, what)
 ) -> dict[str, Any]:
     """Draw people and write report.html, people.csv, faces.png and summary.json into a folder.
-
-    Args:
-        population: the people.
-        output: the folder.
-        size: how many people, and the seed.
-        backend: the render backend.
-        threads: total number of processor threads; by default all.
-        overwrite: replace the contents of the folder.
-        progress: called with (steps done, steps in all, what).
 
     Raises:
         InputError: the folder is not empty.

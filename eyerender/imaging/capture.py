@@ -163,24 +163,17 @@ class BegunImage:
 
 
 def begin_each(
-    many: Iterable[RenderableFrames],
-    renderer: Renderer,
+    many: Iterable[RenderableFrames],  # the frames, one scene after the other
+    renderer: Renderer,  # what traces them
     *,
-    highlights: bool = False,
-    annotated: bool = False,
-    geometry: tuple[str, ...] = (),
+    highlights: bool = False,  # whether to find the highlights of wet and oily surfaces
+    annotated: bool = False,  # whether to compute the masks that people would draw
+    geometry: tuple[str, ...] = (),  # kinds of geometry to find: depth, normals, iris_coordinates, instances
 ) -> Iterator[BegunImage]:
     """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
 
     The next frames are fetched before the last ones are traced, so that a second thread can prepare them. If fetching
     fails, the frames at hand are traced first.
-
-    Args:
-        many: the frames, one scene after the other.
-        renderer: what traces them.
-        highlights: whether to find the highlights of wet and oily surfaces.
-        annotated: whether to compute the masks that people would draw.
-        geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
 
     Raises:
         InputError: a scene's windows cannot be rendered.

@@ -17,28 +17,18 @@ DRAWN_KEYS = ("attempt", "subject_attempt", "draws")
 
 
 def image_line(
-    scene: Scene,
-    record: Mapping[str, Any],
-    window: Window,
-    labels: Mapping[str, Any],
+    scene: Scene,  # the rendered scene
+    record: Mapping[str, Any],  # the record of the eye that it shows
+    window: Window,  # (x0, y0, width, height) in full-sensor pixels
+    labels: Mapping[str, Any],  # its labels
     *,
+    # `timestamp_s`, the time that the camera stored, and in a dataset values of `SAMPLE_KEYS`
     sample: Mapping[str, Any] | None = None,
-    drawn: Mapping[str, Any] | None = None,
-    tree: Mapping[str, Any] | None = None,
-    eye: Mapping[str, Any] | None = None,
+    drawn: Mapping[str, Any] | None = None,  # values of `DRAWN_KEYS`, in a dataset
+    tree: Mapping[str, Any] | None = None,  # keys of the scene; default: all
+    eye: Mapping[str, Any] | None = None,  # keys of the eye file; default: those of the scene's eye
 ) -> dict[str, Any]:
-    """Return the line of an image; the keys of files are null.
-
-    Args:
-        scene: the rendered scene.
-        record: the record of the eye that it shows.
-        window: (x0, y0, width, height) in full-sensor pixels.
-        labels: its labels.
-        sample: `timestamp_s`, the time that the camera stored, and in a dataset values of `SAMPLE_KEYS`.
-        drawn: values of `DRAWN_KEYS`, in a dataset.
-        tree: keys of the scene; default: all.
-        eye: keys of the eye file; default: those of the scene's eye.
-    """
+    """Return the line of an image; the keys of files are null."""
     tree = scene.spec.to_mapping() if tree is None else tree
     eye = scene.eye_file(record["eye"]).to_mapping() if eye is None else eye
     spec, contact = scene.spec, scene.contact_lens(record["eye"])

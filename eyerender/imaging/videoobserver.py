@@ -53,26 +53,17 @@ class VideoOutput:
 
 
 def observe_video(
-    video: VideoReader,
-    observer: ImageObserver,
-    output: VideoOutput = VideoOutput(),
+    video: VideoReader,  # the video, of which nothing has been read
+    observer: ImageObserver,  # the image observer, with its settings and gamma
+    output: VideoOutput = VideoOutput(),  # files to write
     *,
-    scene: Scene | None = None,
-    eyes: int = 1,
-    progress: Progress | None = None,
+    scene: Scene | None = None,  # the scene whose rig took the video
+    eyes: int = 1,  # 1, or 2 for frames with both eyes, as in `ImageObserver.observe_files`
+    progress: Progress | None = None,  # called after each frame
+    # receives a warning if frames have colour or are missing; if it raises, nothing is written
     warn: Warn | None = None,
 ) -> VideoSummary:
-    """Extract the features of a video's frames.
-
-    Args:
-        video: the video, of which nothing has been read.
-        observer: the image observer, with its settings and gamma.
-        output: files to write.
-        scene: the scene whose rig took the video.
-        eyes: 1, or 2 for frames with both eyes, as in `ImageObserver.observe_files`.
-        progress: called after each frame.
-        warn: receives a warning if frames have colour or are missing; if it raises, nothing is written.
-    """
+    """Extract the features of a video's frames."""
     count = pupils = ok = coloured = 0
     with ExitStack() as stack:
         file = None if output.records is None else stack.enter_context(written(output.records, sync=False))

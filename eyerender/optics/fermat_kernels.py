@@ -503,51 +503,32 @@ def given_start(surfaces: Surfaces, rimmed: int, batch: Batch, nodes: Nodes, gue
     SHEET=SHEET,
 )
 def connect_all(
-    kinds: Ints,
-    sheets: Sheets,
-    table: Floats,
-    ladder: Floats,
-    rims: Floats,
-    viewpoint: Floats,
-    target: Floats,
+    kinds: Ints,  # kinds of the surfaces, outside in
+    sheets: Sheets,  # (1 or n, s) surfaces
+    table: Floats,  # table of the surfaces
+    ladder: Floats,  # (1 or n, s + 1) index in front of the first surface, then that behind each
+    rims: Floats,  # (1 or n,) radius at which the rimmed surface ends
+    viewpoint: Floats,  # (3, 1 or n, 1 or m) mm
+    target: Floats,  # (3, 1 or n, 1 or m) mm
+    # (1 or n, s, 9) elliptical outlines of the surfaces: centre, and both axes over their lengths, 0 for none; or (1,
+    # 0, 9)
     outlines: Floats,
+    # whether the rimmed surface reflects the rays; those behind it in the list are crossed on the way out
     reflects: bool,
-    rimmed: int,
-    given: bool,
-    guesses: Floats,
-    exits: Floats,
-    ways: Floats,
-    ends: Floats,
-    met: Floats,
-    arriving: Floats,
-    residuals: Floats,
-    state: Statuses,
+    rimmed: int,  # number of the surface with a rim, from 1: the outermost one of the eye
+    given: bool,  # whether `guesses` are given
+    guesses: Floats,  # (3, n, m) first guesses of mirror points, written if it reflects and they are not given
+    exits: Floats,  # (3, n, m) points on the outermost surface, written
+    ways: Floats,  # (3, n, m) directions to them from the viewpoint, written
+    ends: Floats,  # (3, n, m) directions in the last medium, written
+    met: Floats,  # (3, n, m) points on the rimmed surface, written; or empty
+    arriving: Floats,  # (3, n, m) directions before it, written; or empty
+    residuals: Floats,  # (n, m) misses of the traced rays, mm, written
+    state: Statuses,  # (n, m), initially LOST, written
 ) -> None:
     """Solve for the rays from viewpoints to targets, through all surfaces; the rimmed one may reflect them instead.
 
     Every path is traced from the viewpoint; a ray that misses the target by more than rounding is LOST.
-
-    Args:
-        kinds: kinds of the surfaces, outside in.
-        sheets: (1 or n, s) surfaces.
-        table: table of the surfaces.
-        ladder: (1 or n, s + 1) index in front of the first surface, then that behind each.
-        rims: (1 or n,) radius at which the rimmed surface ends.
-        viewpoint: (3, 1 or n, 1 or m) mm.
-        target: (3, 1 or n, 1 or m) mm.
-        outlines: (1 or n, s, 9) elliptical outlines of the surfaces: centre, and both axes over their lengths, 0 for
-            none; or (1, 0, 9).
-        reflects: whether the rimmed surface reflects the rays; those behind it in the list are crossed on the way out.
-        rimmed: number of the surface with a rim, from 1: the outermost one of the eye.
-        given: whether `guesses` are given.
-        guesses: (3, n, m) first guesses of mirror points, written if it reflects and they are not given.
-        exits: (3, n, m) points on the outermost surface, written.
-        ways: (3, n, m) directions to them from the viewpoint, written.
-        ends: (3, n, m) directions in the last medium, written.
-        met: (3, n, m) points on the rimmed surface, written; or empty.
-        arriving: (3, n, m) directions before it, written; or empty.
-        residuals: (n, m) misses of the traced rays, mm, written.
-        state: (n, m), initially LOST, written.
     """
     nodes, surfaces = np.zeros(len(kinds) + 2, dtype=NODE), Surfaces(kinds, sheets, table)
     for first in range(0, state.size, LANES):

@@ -109,31 +109,22 @@ def mirrored_rays(surface: Surface, source: Xyz, viewpoint: Xyz, *, rim_mm: Floa
 
 
 def joined_rays(
-    path: Sequence[Crossing],
-    n_outside: float,
-    viewpoint: Xyz,
-    target: Xyz,
+    path: Sequence[Crossing],  # the crossings, in order from the viewpoint. One of them may reflect: `rimmed`
+    n_outside: float,  # index at the viewpoint
+    viewpoint: Xyz,  # components of the viewpoints
+    target: Xyz,  # components of the targets; both broadcast
+    # number of the crossing whose rim counts, the outermost one of the eye. Surfaces in front of it (lenses of
+    # spectacles) have none here
     rimmed: int = 0,
     *,
+    # (..., s, 3, 3) elliptical outlines of lenses: centre, and both axes over their lengths, 0 for surfaces without
+    # one. Rays of the compiled solver that pass outside have the status AT_LENS_EDGE; others, whose `met` is NaN, are
+    # not checked
     outlines: Floats | None = None,
-    starts: Xyz | None = None,
-    thorough: bool = True,
+    starts: Xyz | None = None,  # points on the mirror from which rays are searched
+    thorough: bool = True,  # whether to search for rays that the compiled solver does not find
 ) -> Rays:
-    """Solve for the rays from viewpoints through a path to targets: refracted ones, or those that a surface reflects.
-
-    Args:
-        path: the crossings, in order from the viewpoint. One of them may reflect: `rimmed`.
-        n_outside: index at the viewpoint.
-        viewpoint: components of the viewpoints.
-        target: components of the targets; both broadcast.
-        rimmed: number of the crossing whose rim counts, the outermost one of the eye. Surfaces in front of it (lenses
-            of spectacles) have none here.
-        outlines: (..., s, 3, 3) elliptical outlines of lenses: centre, and both axes over their lengths, 0 for surfaces
-            without one. Rays of the compiled solver that pass outside have the status AT_LENS_EDGE; others, whose
-            `met` is NaN, are not checked.
-        starts: points on the mirror from which rays are searched.
-        thorough: whether to search for rays that the compiled solver does not find.
-    """
+    """Solve for the rays from viewpoints through a path to targets, refracted or reflected by one of its surfaces."""
     edge, graphs = path[rimmed], graphs_of(*(crossing.surface for crossing in path))
     if graphs is None:
         ndim = max(viewpoint[0].ndim, target[0].ndim)

@@ -30,25 +30,17 @@ IMAGES = 100_000
 
 
 def inspect(
-    folder: str | Path,
-    other: str | Path | None = None,
+    folder: str | Path,  # the dataset's folder; with `planned`, its spec or the name of a shipped one
+    other: str | Path | None = None,  # a second dataset, to which it is compared
     *,
-    output: str | Path | None = None,
-    images: int = IMAGES,
+    output: str | Path | None = None,  # the HTML page; None: no page
+    images: int = IMAGES,  # the largest number of images that are read of a dataset, spread evenly over it
+    # draw the samples of a spec instead of reading a folder: splits, distributions and dependences of draws
     planned: bool = False,
-    workers: int = 1,
-    progress: Progress | None = None,
+    workers: int = 1,  # processes that read them; the result does not depend on their number
+    progress: Progress | None = None,  # called with (images read, images to read, what)
 ) -> dict[str, Any]:
     """Look into a dataset, and write a page about it.
-
-    Args:
-        folder: the dataset's folder; with `planned`, its spec or the name of a shipped one.
-        other: a second dataset, to which it is compared.
-        output: the HTML page; None: no page.
-        images: the largest number of images that are read of a dataset, spread evenly over it.
-        planned: draw the samples of a spec instead of reading a folder: splits, distributions and dependences of draws.
-        workers: processes that read them; the result does not depend on their number.
-        progress: called with (images read, images to read, what).
 
     Returns:
         What was found (`eyerender/inspection/1`): `datasets`, one or two, and `difference`.

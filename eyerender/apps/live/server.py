@@ -37,19 +37,13 @@ _ENDING_S = 1.2
 def serve(
     scene: Scene,
     *,
-    port: int = 0,
-    backend: BackendChoice = "auto",
-    threads: int | None = None,
+    port: int = 0,  # the port; 0 selects a free one
+    backend: BackendChoice = "auto",  # the render backend
+    threads: int | None = None,  # processor threads for rendering; None: all
+    # called with the address (with its token) as soon as the page can be opened
     announce: Callable[[str], None] = print,
 ) -> None:
     """Show a scene on a local web page. An interrupt ends the process with exit code 130.
-
-    Args:
-        scene: the scene.
-        port: the port; 0 selects a free one.
-        backend: the render backend.
-        threads: processor threads for rendering; None: all.
-        announce: called with the address (with its token) as soon as the page can be opened.
 
     Raises:
         InputError: the port is taken.

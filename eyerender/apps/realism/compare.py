@@ -89,21 +89,14 @@ def _tile(s: Scaled) -> Bytes:
 
 
 def realism(
-    folders: Sequence[str | Path],
+    folders: Sequence[str | Path],  # the folders, as for `measure_folder`
     *,
-    output: str | Path | None = None,
-    gammas: Sequence[float] = (),
-    limit: int = DEFAULT_LIMIT,
-    progress: Progress | None = None,
+    output: str | Path | None = None,  # an HTML page to write, with the table and montages at equal scale
+    gammas: Sequence[float] = (),  # none, one for all folders, or one for each
+    limit: int = DEFAULT_LIMIT,  # the largest number of images of a folder
+    progress: Progress | None = None,  # called with (images done, images in all, "images") for each folder
 ) -> dict[str, Any]:
     """Measure one folder of pictures, two to compare, or one and three or more cameras.
-
-    Args:
-        folders: the folders, as for `measure_folder`.
-        output: an HTML page to write, with the table and montages at equal scale.
-        gammas: none, one for all folders, or one for each.
-        limit: the largest number of images of a folder.
-        progress: called with (images done, images in all, "images") for each folder.
 
     Returns:
         A mapping (schema eyerender/realism/2): the definitions, the statistics of each folder, and for two folders the

@@ -71,28 +71,20 @@ class Bias:
 
 
 def run_rig(
+    # provides the rig, sensor, first eye and first head position; cameras and LEDs that serve only the other eye count
+    # for eye safety alone
     scene: Scene,
-    population: Population,
-    output: str | Path,
-    size: RigSize = RigSize(),
+    population: Population,  # the people
+    output: str | Path,  # the folder
+    size: RigSize = RigSize(),  # number of people, and range of gaze
     *,
-    unknowns: Unknowns | None = None,
+    unknowns: Unknowns | None = None,  # the priors of the bound; default: `Unknowns.population()`
+    # deviations of units from the nominal rig, which the estimators know; for the first `UNIT_PEOPLE`
     tolerances: Tolerances | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    overwrite: bool = False,  # replace the contents of the folder
+    progress: Progress | None = None,  # called with (people done, people in all, what)
 ) -> dict[str, Any]:
     """Evaluate a scene's rig over a population; write report.html, summary.json, people.csv and gaze.csv into a folder.
-
-    Args:
-        scene: provides the rig, sensor, first eye and first head position; cameras and LEDs that serve only the other
-            eye count for eye safety alone.
-        population: the people.
-        output: the folder.
-        size: number of people, and range of gaze.
-        unknowns: the priors of the bound; default: `Unknowns.population()`.
-        tolerances: deviations of units from the nominal rig, which the estimators know; for the first `UNIT_PEOPLE`.
-        overwrite: replace the contents of the folder.
-        progress: called with (people done, people in all, what).
 
     Raises:
         InputError: the folder is not empty, no drawn eye is physically possible, or a tolerance is that of no part.
@@ -141,22 +133,14 @@ def survey_of(scene: Scene, population: Population, size: RigSize, unknowns: Unk
 
 
 def estimator_errors(
-    survey: RigPopulation,
-    subjects: Sequence[int],
-    progress: Progress | None = None,
+    survey: RigPopulation,  # the rig and the people
+    subjects: Sequence[int],  # numbers of the people
+    progress: Progress | None = None,  # called with (people done, people in all, what)
     *,
-    images: bool = False,
-    backend: BackendChoice = "auto",
+    images: bool = False,  # use extracted features of rendered images of 25 targets, instead of exact features of 81
+    backend: BackendChoice = "auto",  # the render backend for these images
 ) -> list[Bias]:
-    """Compute gaze errors of the estimators for some people, calibrated on nine targets a metre away.
-
-    Args:
-        survey: the rig and the people.
-        subjects: numbers of the people.
-        progress: called with (people done, people in all, what).
-        images: use extracted features of rendered images of 25 targets, instead of exact features of 81.
-        backend: the render backend for these images.
-    """
+    """Compute gaze errors of the estimators for some people, calibrated on nine targets a metre away."""
     cells = np.array([GRID * r + c for r in range(0, GRID, 2) for c in range(0, GRID, 2)])
     cells = cells if images else np.arange(GRID * GRID)
     chosen = np.flatnonzero(np.isin(cells, CALIBRATION_CELLS))

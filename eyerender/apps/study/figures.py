@@ -47,19 +47,12 @@ def clouds_figure(clouds: Mapping[str, Cloud]) -> str:
 
 
 def heads_figure(
-    own: Mapping[str, Mapping[str, Mapping[str, float]]],
-    paper: Mapping[str, tuple[float, float]],
-    measured: Mapping[str, Floats],
-    interval: Mapping[str, tuple[float, float]],
+    own: Mapping[str, Mapping[str, Mapping[str, float]]],  # label -> eye model -> head -> mean (deg)
+    paper: Mapping[str, tuple[float, float]],  # eye model -> (H1, H2)
+    measured: Mapping[str, Floats],  # head -> participants (deg)
+    interval: Mapping[str, tuple[float, float]],  # head -> 95 % confidence interval of the participants' mean (deg)
 ) -> str:
-    """Draw Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's.
-
-    Args:
-        own: label -> eye model -> head -> mean (deg).
-        paper: eye model -> (H1, H2).
-        measured: head -> participants (deg).
-        interval: head -> 95 % confidence interval of the participants' mean (deg).
-    """
+    """Draw Figure 4: errors at H1 and H2 by eye model, beside the paper's and the experiment's."""
     models = list(dict.fromkeys(m for by_model in own.values() for m in by_model))
     highest = [v[h] for by_model in own.values() for v in by_model.values() for h in v]
     top = 1.08 * max([*highest, *(float(v.max()) for v in measured.values()), *(high for _, high in interval.values())])

@@ -15,21 +15,13 @@ Measure = Callable[[Observations, RigGeometry, frozenset[str]], dict[str, float 
 
 
 def waterfall(
-    eye: str,
-    departures: Sequence[Departure],
-    scene: Callable[[str, Collection[str]], Scene],
-    of_scene: Collection[str],
-    measure: Measure,
+    eye: str,  # the eye model
+    departures: Sequence[Departure],  # all departures, in their order
+    scene: Callable[[str, Collection[str]], Scene],  # builds the scene of an eye with some departures
+    of_scene: Collection[str],  # the departures that change the scene, so that others share its observations
+    measure: Measure,  # computes the errors (deg) by name from observations, rig and departures
 ) -> list[WaterfallStep]:
-    """Correct departures one after the other; also correct each of them alone.
-
-    Args:
-        eye: the eye model.
-        departures: all departures, in their order.
-        scene: builds the scene of an eye with some departures.
-        of_scene: the departures that change the scene, so that others share its observations.
-        measure: computes the errors (deg) by name from observations, rig and departures.
-    """
+    """Correct departures one after the other; also correct each of them alone."""
     seen: dict[frozenset[str], tuple[Scene, Observations]] = {}
 
     def measured(some: frozenset[str]) -> dict[str, Any]:

@@ -58,23 +58,15 @@ class SweepRun:
 
 
 def run_sweep(
-    spec: SweepSpec,
-    scene: Scene,
-    output: str | Path,
-    how: SweepRun = SweepRun(),
+    spec: SweepSpec,  # the sweep
+    scene: Scene,  # the sweep's base scene (`spec.base`)
+    output: str | Path,  # the folder, which may hold a part of the same sweep
+    how: SweepRun = SweepRun(),  # options of the run
     *,
-    progress: Progress | None = None,
-    say: Say = lambda _text: None,
+    progress: Progress | None = None,  # called with (layouts done, layouts of this run, what)
+    say: Say = lambda _text: None,  # called with a message for each problem that does not end the run
 ) -> dict[str, Any]:
     """Evaluate the missing layouts of a sweep; once all are there, write summary.json, layouts.csv and report.html.
-
-    Args:
-        spec: the sweep.
-        scene: the sweep's base scene (`spec.base`).
-        output: the folder, which may hold a part of the same sweep.
-        how: options of the run.
-        progress: called with (layouts done, layouts of this run, what).
-        say: called with a message for each problem that does not end the run.
 
     Raises:
         InputError: a layout is impossible, a tolerance is that of no part, or the folder holds something else.
