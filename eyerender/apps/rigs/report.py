@@ -6,7 +6,6 @@ Ray optics gives all features; nothing is rendered. The features are exact, so a
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from ...backends.choose import BackendChoice
 from ...base.arrays import Floats, Ints, finite_or_none
 from ...base.errors import InputError
 from ...base.progress import Progress, notify
-from ...base.storage.files import write_json
+from ...base.storage.files import csv_text, write_json, write_text
 from ...design.crowd import (
     SHIFTS_MM,
     coverage_of,
@@ -111,8 +110,8 @@ def run_rig(
             weights = FeatureNoise.of(OUTLINE_PX, GLINT_PX, rig=scene.rig)  # those of `MaximumLikelihood`
             data |= tolerated(survey, tolerances, own, weights, min(UNIT_PEOPLE, size.people))
         write_json(folder / SUMMARY, data)
-        _write_people(folder / PEOPLE, found)
-        _write_gaze(folder / GAZE, survey, found)
+        write_text(folder / PEOPLE, _people_csv(found))
+        write_text(folder / GAZE, _gaze_csv(survey, found))
         write_page(folder / REPORT, page_of(scene, survey, found, data))
     return data
 
@@ -259,29 +258,26 @@ def _slippage_of(shifts_mm: Floats, found: Sequence[Figures]) -> list[dict[str, 
     ]
 
 
-def _write_people(path: Path, found: Figures) -> None:
-    """Write one row per person."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["subject", "bound_e95_deg", "frame_to_frame_e95_deg", "outline", "glints", "covered_2_glints"])
-        for k, subject in enumerate(found.subject):
-            e95 = (np.quantile(v[k], 0.95, method="higher") for v in (found.bound_deg, found.noise_deg))
-            means = (found.outline[k].mean(), found.glints[k].mean(), covered(found)[k].mean())
-            writer.writerow([subject, *(f"{value:.6g}" for value in (*e95, *means))])
+def _people_csv(found: Figures) -> str:
+    """Format one row per person."""
+    header = ["subject", "bound_e95_deg", "frame_to_frame_e95_deg", "outline", "glints", "covered_2_glints"]
+    e95 = [np.quantile(v, 0.95, axis=1, method="higher") for v in (found.bound_deg, found.noise_deg)]
+    means = [v.mean(axis=1) for v in (found.outline, found.glints, covered(found))]
+    return csv_text(header, _cells(np.stack([*e95, *means], axis=1), found.subject))
 
 
-def _write_gaze(path: Path, survey: RigPopulation, found: Figures) -> None:
-    """Write one row per direction."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        names = [f"glints_missing_{name}" for name in LOST]
-        writer.writerow(
-            ["azimuth_deg", "elevation_deg", "bound_deg", "frame_to_frame_deg", "outline", "glints", *names]
-        )
-        for k, direction in enumerate(survey.directions_deg):
-            values = [np.median(found.bound_deg[:, k]), np.median(found.noise_deg[:, k]), found.outline[:, k].mean()]
-            values += [found.glints[:, k].mean(), *found.lost[:, k].mean(axis=0)]
-            writer.writerow([f"{value:.6g}" for value in (*direction, *values)])
+def _gaze_csv(survey: RigPopulation, found: Figures) -> str:
+    """Format one row per direction."""
+    header = ["azimuth_deg", "elevation_deg", "bound_deg", "frame_to_frame_deg", "outline", "glints"]
+    figures = [np.median(v, axis=0) for v in (found.bound_deg, found.noise_deg)]
+    figures += [found.outline.mean(axis=0), found.glints.mean(axis=0), *found.lost.mean(axis=0).T]
+    rows = np.column_stack([survey.directions_deg, *figures])
+    return csv_text([*header, *(f"glints_missing_{name}" for name in LOST)], _cells(rows))
+
+
+def _cells(rows: Floats, *first: Any) -> list[list[Any]]:
+    """Format numbers (n, m), after the values of columns that come first."""
+    return [[*(column[k] for column in first), *(f"{v:.6g}" for v in row)] for k, row in enumerate(rows)]
 
 
 def page_of(scene: Scene, survey: RigPopulation, found: Figures, data: dict[str, Any]) -> Page:

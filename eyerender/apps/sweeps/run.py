@@ -6,7 +6,6 @@ sweep and the layout's number.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import os
@@ -23,7 +22,7 @@ from ...base.arrays import Bools
 from ...base.errors import EyerenderError, InputError
 from ...base.processes import process_pool
 from ...base.progress import Progress, Say, notify
-from ...base.storage.files import make_folder, read_json, write_json
+from ...base.storage.files import csv_text, make_folder, read_json, write_json, write_text
 from ...base.storage.lock import final_lock, run_lock
 from ...design.choice import choose_lights, noise_of_some
 from ...design.crowd import coverage_of, covered, gaze_of
@@ -266,7 +265,7 @@ def _finish(folder: Path, spec: SweepSpec, scene: Scene, layouts: Sequence[RigLa
         "rows": rows,
     }  # fmt: skip
     write_json(folder / SUMMARY, data)
-    _write_table(folder / TABLE, rows)
+    write_text(folder / TABLE, _table(rows))
     write_report(folder / REPORT, data)
     return data
 
@@ -285,17 +284,15 @@ def _read(path: Path, number: int) -> dict[str, Any]:
     return row
 
 
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV table with one row per layout."""
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format the layouts as CSV, one row each."""
     names = list(rows[0]["values"])
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["layout", *names, "noise_deg", "U50E95_deg", "U95E95_deg", "dropout", "leds", "cornea_w_m2",
-                         "cornea_share", "sharp_depth_mm", "field", "units_deg", "chosen", "pareto"])  # fmt: skip
-        for row in rows:
-            users = row["frame_to_frame_deg"]
-            values = [json.dumps(row["values"][name]) for name in names]
-            writer.writerow([row["number"], *values, row["noise_deg"], users["U50E95"], users["U95E95"], row["dropout"],
-                             row["leds"], row["cornea_w_m2"], row["cornea_share"], row["sharp_depth_mm"],
-                             row["field"], row["units_deg"],
-                             " ".join(map(str, row["chosen"])), row["pareto"]])  # fmt: skip
+    plain = ("dropout", "leds", "cornea_w_m2", "cornea_share", "sharp_depth_mm", "field", "units_deg")
+    header = ["layout", *names, "noise_deg", "U50E95_deg", "U95E95_deg", *plain, "chosen", "pareto"]
+    lines = []
+    for row in rows:
+        users, chosen = row["frame_to_frame_deg"], " ".join(map(str, row["chosen"]))
+        values = [json.dumps(row["values"][name]) for name in names]
+        known = [row["noise_deg"], users["U50E95"], users["U95E95"], *(row[key] for key in plain)]
+        lines.append([row["number"], *values, *known, chosen, row["pareto"]])
+    return csv_text(header, lines)
