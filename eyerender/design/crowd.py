@@ -21,22 +21,14 @@ _PIECE = 20
 
 
 def figures_of_people(
-    survey: RigPopulation,
-    noise: FeatureNoise,
-    people: int,
+    survey: RigPopulation,  # rig and population
+    noise: FeatureNoise,  # noise of the features
+    people: int,  # number of people
     *,
-    workers: int | None = None,
-    progress: Progress | None = None,
+    workers: int | None = None,  # processes; None: one for each processor
+    progress: Progress | None = None,  # called with (people done, people in all, what)
 ) -> Figures:
-    """Compute the figures of the first people, in pieces that do not depend on the number of processes.
-
-    Args:
-        survey: rig and population.
-        noise: noise of the features.
-        people: number of people.
-        workers: processes; None: one for each processor.
-        progress: called with (people done, people in all, what).
-    """
+    """Compute the figures of the first people, in pieces that do not depend on the number of processes."""
     firsts = range(0, people, _PIECE)
     counts = [min(_PIECE, people - first) for first in firsts]
     workers = min(workers or os.cpu_count() or 1, len(firsts))

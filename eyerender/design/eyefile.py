@@ -35,10 +35,7 @@ def changed_file(spec: EyeSpec, theta: Floats) -> EyeSpec:
 
     The pupil's ellipticity becomes the second harmonic of its contour, which is right to first order. The lens moves
     with the pupil, which rests on it. The fovea is placed so that the line of sight keeps its direction in the eye,
-    turned by kappa.
-
-    Raises:
-        InputError: the eye is physically impossible.
+    turned by kappa. Raises InputError if the eye is physically impossible.
     """
     if not np.any(np.delete(theta, POSITION)[LOCAL:]):
         return spec

@@ -34,21 +34,13 @@ _LEAST_RATIO = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MeasuredFeatures(ArrayValue):
-    """Observed features of n views.
+    """Observed features of n views."""
 
-    Attributes:
-        outline_px: (n, k, 2) points of the outline; 0 if missing.
-        outline_white: (n, k, k) whitening of their distances; 0 without an outline.
-        outline_size: (n,) number of independent distances.
-        glints_px: (n, m, 2) glint of each light; 0 if missing.
-        glint_white: (n, m, 2, 2) whitening of their shifts; 0 without a glint.
-    """
-
-    outline_px: Floats
-    outline_white: Floats
-    outline_size: Ints
-    glints_px: Floats
-    glint_white: Floats
+    outline_px: Floats  # (n, k, 2) points of the outline; 0 if missing
+    outline_white: Floats  # (n, k, k) whitening of their distances; 0 without an outline
+    outline_size: Ints  # (n,) number of independent distances
+    glints_px: Floats  # (n, m, 2) glint of each light; 0 if missing
+    glint_white: Floats  # (n, m, 2, 2) whitening of their shifts; 0 without a glint
 
     def take(self, rows: Ints) -> MeasuredFeatures:
         """Select views."""
@@ -165,23 +157,14 @@ def _of_ellipse(centre: Floats, axes: Floats, angle: float) -> tuple[Floats, Flo
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Residuals:
-    """Whitened residuals of n views, and their derivatives with respect to the unknowns.
+    """Whitened residuals of n views, and their derivatives with respect to the unknowns."""
 
-    Attributes:
-        outline: (n, k) residuals of outlines.
-        glints: (n, m, 2) residuals of glints.
-        outline_slopes: (n, k, 35) derivatives; empty if not requested.
-        glint_slopes: (n, m, 2, 35) derivatives.
-        outline_size: (n,) number of independent distances that the model has too.
-        glint_ok: (n, m) whether a glint is both observed and modelled.
-    """
-
-    outline: Floats
-    glints: Floats
-    outline_slopes: Floats
-    glint_slopes: Floats
-    outline_size: Ints
-    glint_ok: Bools
+    outline: Floats  # (n, k) residuals of outlines
+    glints: Floats  # (n, m, 2) residuals of glints
+    outline_slopes: Floats  # (n, k, 35) derivatives; empty if not requested
+    glint_slopes: Floats  # (n, m, 2, 35) derivatives
+    outline_size: Ints  # (n,) number of independent distances that the model has too
+    glint_ok: Bools  # (n, m) whether a glint is both observed and modelled
 
 
 def residuals(seen: MeasuredFeatures, model: ModelFeatures | FeatureSlopes) -> Residuals:
@@ -217,12 +200,9 @@ def outline_distances(model_px: Floats, slopes: Floats | None, observed_px: Floa
     """Compute signed distances (n, k) px of points from modelled outlines along their normals, and derivatives.
 
     The outline through the modelled points is their trigonometric interpolation p(f). The foot of a point o satisfies
-    (p(f) - o) . p'(f) = 0 (Newton's steps from the nearest point), and its distance is n . (o - p).
-
-    Args:
-        model_px: (n, j, 2) points, evenly spaced in the parameter.
-        slopes: (n, j, 2, 35) their derivatives, or None.
-        observed_px: (n, k, 2).
+    (p(f) - o) . p'(f) = 0 (Newton's steps from the nearest point), and its distance is n . (o - p). `model_px`: (n, j,
+    2) points, evenly spaced in the parameter; `slopes`: (n, j, 2, 35) their derivatives, or None; `observed_px`: (n, k,
+    2).
     """
     count = model_px.shape[1]
     waves = np.arange((count - 1) // 2 + 1)

@@ -65,31 +65,18 @@ DEFAULT_OUTLINE_PX, DEFAULT_GLINT_PX = 0.1, 0.05
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Problem:
-    """A fit to solve: the views of one eye with their features.
+    """A fit to solve: the views of one eye with their features."""
 
-    Attributes:
-        views: n views.
-        seen: features of the views.
-        instant: (n,) instant of each view.
-        instants: one view for each of i instants.
-        target_mm: (i, 3) known targets; NaN where there is none.
-        fixation_rad: noise of fixation per axis.
-        centre: (i, 35) means of the priors.
-        precision: (35,) inverse variances of the priors.
-        free: (35,) which unknowns are fitted.
-        robust: the weights.
-    """
-
-    views: Views
-    seen: MeasuredFeatures
-    instant: Ints
-    instants: Views
-    target_mm: Floats
-    fixation_rad: float
-    centre: Floats
-    precision: Floats
-    free: Bools
-    robust: Robust
+    views: Views  # n views
+    seen: MeasuredFeatures  # features of the views
+    instant: Ints  # (n,) instant of each view
+    instants: Views  # one view for each of i instants
+    target_mm: Floats  # (i, 3) known targets; NaN where there is none
+    fixation_rad: float  # noise of fixation per axis
+    centre: Floats  # (i, 35) means of the priors
+    precision: Floats  # (35,) inverse variances of the priors
+    free: Bools  # (35,) which unknowns are fitted
+    robust: Robust  # the weights
 
     @property
     def shared(self) -> bool:
@@ -371,11 +358,7 @@ def _refuse_strange(problem: Problem, theta: Floats) -> None:
 def problem_of(
     mine: Observations, rig: RigGeometry, spec: EyeSpec, unknowns: Unknowns, noise: FeatureNoise, options: Options
 ) -> Problem:
-    """Set up the fit of one eye.
-
-    Raises:
-        InputError: there is nothing to fit, or the eye has no position.
-    """
+    """Set up the fit of one eye. Raises InputError if there is nothing to fit, or the eye has no position."""
     index = mine.index
     side = EYES[max(int(index.eye[0]), 0)] if len(index) else "right"
     seen = measured(mine, noise, len(rig.lights))

@@ -43,21 +43,13 @@ _ROWS = 256
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Case:
-    """Views and their instants, the input of all analyses of a rig.
+    """Views and their instants, the input of all analyses of a rig."""
 
-    Attributes:
-        views: n views.
-        instant: (n,) the instant of each view, 0 to i - 1.
-        instants: one view for each of i instants, for values that do not depend on the camera.
-        theta: (i, 35) the true unknowns.
-        target_mm: (i, 3) fixation targets; NaN without one.
-    """
-
-    views: Views
-    instant: Ints
-    instants: Views
-    theta: Floats
-    target_mm: Floats
+    views: Views  # n views
+    instant: Ints  # (n,) the instant of each view, 0 to i - 1
+    instants: Views  # one view for each of i instants, for values that do not depend on the camera
+    theta: Floats  # (i, 35) the true unknowns
+    target_mm: Floats  # (i, 3) fixation targets; NaN without one
 
 
 def case_of(frames: Frames, rig: RigLike | None = None) -> tuple[Case, Ints]:
@@ -152,33 +144,21 @@ def target_information(case: Case, noise: FeatureNoise, rows: Ints) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class EyeInformation(ArrayValue):
-    """Information of a rig about one eye in i instants.
+    """Information of a rig about one eye in i instants."""
 
-    Attributes:
-        eye: right or left.
-        fixation: (i,) fixation of each instant.
-        head: (i,) head position.
-        gaze_covariance_deg2: (i, 2, 2) covariance of the line of sight, to the subject's left and up; inf if
-            undetermined.
-        axis_covariance_deg2: (i, 2, 2) covariance of the optic axis' azimuth and elevation.
-        frame_deviation: (i, 6) standard deviations of each frame's unknowns (`unknowns.FRAME`), rad and mm; 0 if known,
-            inf if undetermined.
-        person_deviation: (29,) standard deviations of the person's unknowns (`unknowns.PERSON`), rad and mm.
-        person_covariance: (29, 29) covariance of these; inf on the diagonal if undetermined.
-        matrices: (i, 35, 35) information of each instant on its unknowns and the person's, without priors.
-        unseen: combinations of unknowns that the rig does not determine, in words.
-    """
-
-    eye: str
-    fixation: Ints
-    head: Ints
+    eye: str  # right or left
+    fixation: Ints  # (i,) fixation of each instant
+    head: Ints  # (i,) head position
+    # (i, 2, 2) covariance of the line of sight, to the subject's left and up; inf if undetermined
     gaze_covariance_deg2: Floats
-    axis_covariance_deg2: Floats
+    axis_covariance_deg2: Floats  # (i, 2, 2) covariance of the optic axis' azimuth and elevation
+    # (i, 6) standard deviations of each frame's unknowns (`unknowns.FRAME`), rad and mm; 0 if known, inf if
+    # undetermined
     frame_deviation: Floats
-    person_deviation: Floats
-    person_covariance: Floats
-    matrices: Floats
-    unseen: tuple[str, ...]
+    person_deviation: Floats  # (29,) standard deviations of the person's unknowns (`unknowns.PERSON`), rad and mm
+    person_covariance: Floats  # (29, 29) covariance of these; inf on the diagonal if undetermined
+    matrices: Floats  # (i, 35, 35) information of each instant on its unknowns and the person's, without priors
+    unseen: tuple[str, ...]  # combinations of unknowns that the rig does not determine, in words
 
     @property
     def gaze_deg(self) -> Floats:
@@ -258,15 +238,10 @@ def information(
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Inverse:
-    """Covariance of each instant's and the person's unknowns, without combinations that are not determined.
+    """Covariance of each instant's and the person's unknowns, without combinations that are not determined."""
 
-    Attributes:
-        covariance: (i, q, q) covariance of the q free unknowns.
-        unseen: for each instant an orthonormal basis (q, u) of its undetermined combinations.
-    """
-
-    covariance: Floats
-    unseen: tuple[Floats, ...]
+    covariance: Floats  # (i, q, q) covariance of the q free unknowns
+    unseen: tuple[Floats, ...]  # for each instant an orthonormal basis (q, u) of its undetermined combinations
 
     def variance_of(self, slopes: Floats) -> Floats:
         """Compute the covariance (i, f, f) of f linear functions (i, f, q); inf on the diagonal if undetermined."""
@@ -284,11 +259,8 @@ def arrow_inverse(matrices: Floats, unknowns: Unknowns) -> Inverse:
     Instants are coupled through the person alone. With the blocks A_i of an instant and its prior, B_i to the person
     and C of the person and its prior, the person's covariance is P = (C - sum B_i^T A_i^-1 B_i)^-1, and that of an
     instant is A_i^-1 + K_i P K_i^T with K_i = A_i^-1 B_i (block inversion). Blocks are scaled to a unit diagonal;
-    directions with an eigenvalue below `UNSEEN` are split off.
-
-    Args:
-        matrices: (i, 35, 35) information of each instant, without priors.
-        unknowns: provides the priors, and which unknowns are free.
+    directions with an eigenvalue below `UNSEEN` are split off. `matrices`: (i, 35, 35) information of each instant,
+    without priors; `unknowns`: provides the priors, and which unknowns are free.
     """
     prior, free = unknowns.precision(), unknowns.free()
     local, person = np.flatnonzero(free[:LOCAL]), LOCAL + np.flatnonzero(free[LOCAL:])

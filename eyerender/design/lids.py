@@ -29,15 +29,10 @@ _ACROSS = (0.2, 0.8, 1.0)  # places across the margin, whose rounded edges are 0
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Lids(ArrayValue):
-    """Lids and lashes in the world, for n directions of gaze.
+    """Lids and lashes in the world, for n directions of gaze."""
 
-    Attributes:
-        margins_mm: (n, e, c, 3) lines along the margins around the eye.
-        lashes_mm: (n, k, p, 4) points along the lashes, and the radii of their tubes there; NaN for no lash.
-    """
-
-    margins_mm: Floats
-    lashes_mm: Floats
+    margins_mm: Floats  # (n, e, c, 3) lines along the margins around the eye
+    lashes_mm: Floats  # (n, k, p, 4) points along the lashes, and the radii of their tubes there; NaN for no lash
 
     @classmethod
     def of(cls, region: Region, eye: EyeModel, place_mm: Floats, grid_deg: Floats) -> Self:

@@ -58,33 +58,19 @@ LOST = ("ray", "sensor", "lid", "lash", "obstacle", "opening")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigPopulation:
-    """A rig and the population in front of it.
+    """A rig and the population in front of it."""
 
-    Attributes:
-        scene: mapping of the scene; only its first eye, first head position, rig and sensor are used.
-        population: mapping of the population.
-        seed: seed of the people.
-        azimuth_deg: half range of the optic axis' azimuth.
-        elevation_deg: half range of its elevation.
-        slippage_mm: standard deviation of the eye's position about the scene's, along each axis.
-        luminance_cd_m2: luminance of what people see, which sets their pupils.
-        unknowns: mapping of `Unknowns`: what is known beforehand.
-        lids: whether lids and lashes hide features.
-        relief_mm: additional standard deviation of the eye relief, the distance along x.
-        shift_mm: common shift of all positions, for maps of slippage.
-    """
-
-    scene: Mapping[str, Any]
-    population: Mapping[str, Any]
-    seed: int = 0
-    azimuth_deg: float = 20.0
-    elevation_deg: float = 15.0
-    slippage_mm: float = 1.5
-    luminance_cd_m2: float = 20.0
-    unknowns: Mapping[str, Any]
-    lids: bool = True
-    relief_mm: float = 0.0
-    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scene: Mapping[str, Any]  # mapping of the scene; only its first eye, first head position, rig and sensor are used
+    population: Mapping[str, Any]  # mapping of the population
+    seed: int = 0  # seed of the people
+    azimuth_deg: float = 20.0  # half range of the optic axis' azimuth
+    elevation_deg: float = 15.0  # half range of its elevation
+    slippage_mm: float = 1.5  # standard deviation of the eye's position about the scene's, along each axis
+    luminance_cd_m2: float = 20.0  # luminance of what people see, which sets their pupils
+    unknowns: Mapping[str, Any]  # mapping of `Unknowns`: what is known beforehand
+    lids: bool = True  # whether lids and lashes hide features
+    relief_mm: float = 0.0  # additional standard deviation of the eye relief, the distance along x
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # common shift of all positions, for maps of slippage
 
     @property
     def directions_deg(self) -> Floats:
@@ -102,28 +88,18 @@ class RigPopulation:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Figures(ArrayValue):
-    """Figures of p people in 81 directions.
+    """Figures of p people in 81 directions."""
 
-    Attributes:
-        subject: (p,) number of the person.
-        bound_deg: (p, 81) standard deviation of the line of sight after a calibration on targets that are fixated
-            exactly; inf if undetermined.
-        fixating_deg: (p, 81) the same with the noise of fixation during the calibration.
-        noise_deg: (p, 81) the same for an exactly known person: the part that differs between frames.
-        outline: (p, 81) visible share of the outline, in the camera that sees most.
-        glints: (p, 81) number of lights whose glint is visible in any camera.
-        lost: (p, 81, 6) glints (of any camera) that are missing for the reasons `LOST`.
-        refused: numbers of people whose eye is physically impossible.
-    """
-
-    subject: Ints
+    subject: Ints  # (p,) number of the person
+    # (p, 81) standard deviation of the line of sight after a calibration on targets that are fixated exactly; inf if
+    # undetermined
     bound_deg: Floats
-    fixating_deg: Floats
-    noise_deg: Floats
-    outline: Floats
-    glints: Ints
-    lost: Ints
-    refused: Ints
+    fixating_deg: Floats  # (p, 81) the same with the noise of fixation during the calibration
+    noise_deg: Floats  # (p, 81) the same for an exactly known person: the part that differs between frames
+    outline: Floats  # (p, 81) visible share of the outline, in the camera that sees most
+    glints: Ints  # (p, 81) number of lights whose glint is visible in any camera
+    lost: Ints  # (p, 81, 6) glints (of any camera) that are missing for the reasons `LOST`
+    refused: Ints  # numbers of people whose eye is physically impossible
 
     @classmethod
     def joined(cls, parts: list[Figures]) -> Figures:
@@ -261,10 +237,8 @@ def seen_features(
 ) -> tuple[FeatureSlopes, Ints]:
     """Trace the features of the views of one camera, and remove those that are hidden.
 
-    `hidden_by` are the lids of the views, and what else hides features.
-
-    Returns:
-        The features that are left, and the numbers (n, 6) of glints lost by reason (`LOST`).
+    `hidden_by` are the lids of the views, and what else hides features. Returns the features that are left, and the
+    numbers (n, 6) of glints lost by reason (`LOST`).
     """
     lids, occluders = hidden_by
     slopes = slopes_of(views, theta, POINTS, free)
@@ -371,18 +345,12 @@ def bounds(case: Case, matrices: Floats, noise: FeatureNoise, unknowns: Unknowns
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Learned:
-    """Information after each person's calibration.
+    """Information after each person's calibration."""
 
-    Attributes:
-        every: (u,) numbers of the free unknowns, first those of a frame, then those of the person.
-        frame: how many of them are a frame's.
-        joint: (i, u, u) information on them in each frame, with the calibration's on the person, equation (7).
-        blocks: the blocks A (r, f, f) and B (r, f, u - f) of the frames of the calibration, with the frame's priors.
-    """
-
-    every: Indices
-    frame: int
-    joint: Floats
+    every: Indices  # (u,) numbers of the free unknowns, first those of a frame, then those of the person
+    frame: int  # how many of them are a frame's
+    joint: Floats  # (i, u, u) information on them in each frame, with the calibration's on the person, equation (7)
+    # the blocks A (r, f, f) and B (r, f, u - f) of the frames of the calibration, with the frame's priors
     blocks: tuple[Floats, Floats]
 
 

@@ -89,17 +89,11 @@ class Tolerances(FileSpec):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class UnitErrors(ArrayValue):
-    """Errors of gaze by the deviations of e axes, one standard deviation each, for p people in 81 directions.
+    """Errors of gaze by the deviations of e axes, one standard deviation each, for p people in 81 directions."""
 
-    Attributes:
-        errors_deg: (p, 81, e, 2) to the subject's left and up.
-        tolerance: (e,) the tolerance of each axis.
-        covered: (p, 81) whether the rig sees two glints and enough of the outline.
-    """
-
-    errors_deg: Floats
-    tolerance: Ints
-    covered: Bools
+    errors_deg: Floats  # (p, 81, e, 2) to the subject's left and up
+    tolerance: Ints  # (e,) the tolerance of each axis
+    covered: Bools  # (p, 81) whether the rig sees two glints and enough of the outline
 
     def by_tolerance(self, count: int) -> list[float]:
         """Compute the standard deviation of the direction of gaze by each of `count` tolerances: median, degrees."""
@@ -161,10 +155,7 @@ def drawn_unit(rig: Rig, tolerances: Tolerances, seed: Sequence[int]) -> Rig:
     """Draw a unit: a rig whose parts deviate from the nominal `rig`, whenever the deviations come about.
 
     Cameras have calibrations, and rings are single LEDs. Deviations are before the rig's mount, and a camera's are
-    along the axes of the camera itself.
-
-    Raises:
-        InputError: a number is not one of the rig's parts.
+    along the axes of the camera itself. Raises InputError if a number is not one of the rig's parts.
     """
     rng, rig = np.random.default_rng(seed), rig.resolved()
     cameras, leds = [camera.unmirrored() for camera in rig.cameras], rig.single_leds()
@@ -247,11 +238,7 @@ def axes_of(scene: Scene, tolerances: Tolerances) -> Iterator[_Axis]:
 
 
 def _numbers(one: Tolerance, k: int, lights: int, cameras: Sequence[Camera]) -> Sequence[int]:
-    """Return the numbers of the parts of tolerance k.
-
-    Raises:
-        InputError: the rig has no such part.
-    """
+    """Return the numbers of the parts of tolerance k. Raises InputError if the rig has no such part."""
     count = lights if one.part == "led" else len(cameras)
     numbers: Sequence[int] = range(count) if one.number == "all" else [one.number]
     if one.part == "mirror":

@@ -58,20 +58,12 @@ _TOGETHER = 240_000
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Views:
-    """n views, each of one eye at one instant by one camera.
+    """n views, each of one eye at one instant by one camera."""
 
-    Attributes:
-        eyes: p eyes of one structure, stacked.
-        person: (n,) the eye of each view.
-        position_mm: (n, 3) apex of the unrotated eye in the world, before slippage.
-        camera: (n,) the camera.
-        rig: the rig.
-    """
-
-    eyes: EyeModel
-    person: Ints
-    position_mm: Floats
-    camera: Ints
+    eyes: EyeModel  # p eyes of one structure, stacked
+    person: Ints  # (n,) the eye of each view
+    position_mm: Floats  # (n, 3) apex of the unrotated eye in the world, before slippage
+    camera: Ints  # (n,) the camera
     rig: RigGeometry
 
     def __len__(self) -> int:
@@ -99,21 +91,13 @@ class ModelFeatures:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FeatureSlopes:
-    """Features of n views with their derivatives with respect to the 35 unknowns.
+    """Features of n views with their derivatives with respect to the 35 unknowns."""
 
-    Attributes:
-        images: the features.
-        outline: (n, k, 2, 35) derivatives, px per rad or mm; 0 for a missing point.
-        glints: (n, m, 2, 35) derivatives, px per rad or mm.
-        outline_ok: (n, k) whether a point is on the sensor, and its derivatives exist.
-        glint_ok: (n, m) the same for glints.
-    """
-
-    images: ModelFeatures
-    outline: Floats
-    glints: Floats
-    outline_ok: Bools
-    glint_ok: Bools
+    images: ModelFeatures  # the features
+    outline: Floats  # (n, k, 2, 35) derivatives, px per rad or mm; 0 for a missing point
+    glints: Floats  # (n, m, 2, 35) derivatives, px per rad or mm
+    outline_ok: Bools  # (n, k) whether a point is on the sensor, and its derivatives exist
+    glint_ok: Bools  # (n, m) the same for glints
 
 
 def stacked_eyes(eyes: Sequence[EyeModel]) -> EyeModel:
