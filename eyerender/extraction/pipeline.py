@@ -37,12 +37,18 @@ APART, APART_PX = 4.0, 0.5
 
 
 def extract(
+    # (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats. A colour image (h,
+    # w, 3 or 4; red first) is converted to luminance, with a warning
     image: NDArray[Any],
     *,
-    bit_depth: int | None = None,
-    gamma: float = 1.0,
-    settings: ExtractionSettings | None = None,
+    bit_depth: int | None = None,  # bits of an integer image; None: those of its type
+    gamma: float = 1.0,  # the image stores intensity^(1 / gamma); 1 for linear data
+    settings: ExtractionSettings | None = None,  # settings of the extractor
+    # the pupil of the previous frame. The search starts there, and continues elsewhere unless the result is certain. A
+    # missing pupil is ignored
     prior: PupilResult | None = None,
+    # the part of the image that is searched: (x, y, width, height), or a mask (h, w) that is not 0 there. Coordinates
+    # stay those of the whole image
     roi: SearchRegion | None = None,
 ) -> Extraction:
     """Extract the pupil ellipse and the glints from an image.
@@ -51,17 +57,6 @@ def extract(
     >>> image = np.where(np.hypot(x - 160, y - 120) < 30, 20, 120).astype(np.uint8)
     >>> er.extract(image).pupil.ellipse.centre_px.round(1).tolist()
     [160.0, 120.0]
-
-    Args:
-        image: (h, w) array of unsigned integers (full scale 2^bit_depth - 1, or that of the type) or floats. A colour
-            image (h, w, 3 or 4; red first) is converted to luminance, with a warning.
-        bit_depth: bits of an integer image; None: those of its type.
-        gamma: the image stores intensity^(1 / gamma); 1 for linear data.
-        settings: settings of the extractor.
-        prior: the pupil of the previous frame. The search starts there, and continues elsewhere unless the result is
-            certain. A missing pupil is ignored.
-        roi: the part of the image that is searched: (x, y, width, height), or a mask (h, w) that is not 0 there.
-            Coordinates stay those of the whole image.
 
     Returns:
         Pupil and glints. If something is not found, the result has a status and a reason.

@@ -19,11 +19,8 @@ SearchRegion = tuple[int, int, int, int] | NDArray[Any]
 def cut_region(image: NDArray[Any], region: SearchRegion) -> tuple[NDArray[Any], tuple[int, int], Bools]:
     """Cut a region out of an image (h, w, ...); pixels outside a mask get the level of the nearest one inside.
 
-    Returns:
-        The part, its first column and row, and which of its pixels (h, w) belong to the region.
-
-    Raises:
-        InputError: the region is empty, is not inside the image, or has another size.
+    Returns the part, its first column and row, and which of its pixels (h, w) belong to the region. Raises InputError
+    if the region is empty, is not inside the image, or has another size.
     """
     (height, width), given = image.shape[:2], np.asarray(region)
     if given.ndim == 2:

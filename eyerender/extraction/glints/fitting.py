@@ -350,10 +350,8 @@ def _descend_all(
 ) -> tuple[Floats, Floats, Bools]:
     """Fit all spots in place, in rounds; `rest` (P,), the image minus B, loses the light of other spots.
 
-    A spot that has not settled goes on while a round halves its squared misfit.
-
-    Returns:
-        (n, 9, 9) products of slopes and residual with the priors, (n,) pixels that count, (n,) whether it settled.
+    A spot that has not settled goes on while a round halves its squared misfit. Returns (n, 9, 9) products of slopes
+    and residual with the priors, (n,) pixels that count, (n,) whether it settled.
     """
     first, n = windows[0], theta.shape[0]
     gram, used = np.zeros((n, PARAMETERS + 1, PARAMETERS + 1)), np.zeros(n)

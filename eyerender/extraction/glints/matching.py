@@ -72,12 +72,8 @@ def predict_glints(
 
     The gaze is approximated by the direction from the centre of rotation to the point where the pupil's ray meets the
     sphere on which the entrance pupil moves (or comes nearest to it). The cornea's centre lies in that direction.
-
-    Returns:
-        Expected glints (l, 2) in px, and the image scale at the eye in px per mm.
-
-    Raises:
-        InputError: the pupil's ray is parallel to the plane x = 0, and there is no position.
+    Returns expected glints (l, 2) in px, and the image scale at the eye in px per mm. Raises InputError if the pupil's
+    ray is parallel to the plane x = 0, and there is no position.
     """
     K3, R3, t3 = (np.asarray(value, dtype=np.float64) for value in (K, R, t_mm))
     camera = -R3.T @ t3

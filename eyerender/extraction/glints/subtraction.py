@@ -58,10 +58,8 @@ def subtract_spots(
     """Subtract the light of the spots `which` (n,) near an ellipse, the pupil boundary, from the image.
 
     A fit describes the flanks of a spot far better than the circle of `affected_pixels`. Where the light exceeds three
-    standard deviations of the noise, the fit is not trusted.
-
-    Returns:
-        The part without that light, and the mask (h, w) of pixels where the light is too bright.
+    standard deviations of the noise, the fit is not trusted. Returns the part without that light, and the mask (h, w)
+    of pixels where the light is too bright.
     """
     reach = float(about.semi_axes_px[0]) + 10.0 + 8.0 * fit.sigma_px.max(axis=1, initial=0.0)
     near = which & (np.hypot(*(fit.xy_px - about.centre_px).T) < reach)

@@ -66,9 +66,7 @@ def _conic_moments(points: Floats, rounding: tuple[float, ...]) -> tuple[tuple[f
     """Compute moments of p = u^2 + v^2 - 2, q = u^2 - v^2 and r = 2 u v of the whitened points (u, v).
 
     `rounding` is the mean (x, y) of the points (k, 2), and the Cholesky factor (11, 21, 22) of their covariance.
-
-    Returns:
-        The mean products pu, pv, qu, qv, ru, rv, and pp, pq, pr, qq, qr, rr without their part along u and v.
+    Returns the mean products pu, pv, qu, qv, ru, rv, and pp, pq, pr, qq, qr, rr without their part along u and v.
     """
     mean_x, mean_y, l11, l21, l22 = rounding
     k = points.shape[0]

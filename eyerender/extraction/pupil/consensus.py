@@ -190,11 +190,9 @@ def _settled(
 
     Edge points are moved outward by the curvature shift: the steepest place of a blurred convex edge, with the whole
     smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. Selected
-    points lie within `tolerance` px; twice that at first.
-
-    Returns:
-        The number of selected points (fewer than 8: too few; -1: they span no ellipse), the ellipse (5,), which points
-        (n,), the moved points (n, 2), and (3,) support, gap and residual as in `BoundaryFit`.
+    points lie within `tolerance` px; twice that at first. Returns the number of selected points (fewer than 8: too few;
+    -1: they span no ellipse), the ellipse (5,), which points (n,), the moved points (n, 2), and (3,) support, gap and
+    residual as in `BoundaryFit`.
     """
     n = points.shape[0]
     ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)

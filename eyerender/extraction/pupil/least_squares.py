@@ -178,10 +178,8 @@ def _pixel_sums(
 def fitted(pixels: BoundaryPixels, model: EdgeModel, held: Floats, steps: int) -> tuple[EdgeModel, Sums]:
     """Fit the model with at most `steps` damped Gauss-Newton steps (Levenberg).
 
-    The cost is sum r^2 plus the parameters' squares times the weights `held` (p,).
-
-    Returns:
-        The model, and the sums there, up to a last tiny step.
+    The cost is sum r^2 plus the parameters' squares times the weights `held` (p,). Returns the model, and the sums
+    there, up to a last tiny step.
     """
     sums, damping = Sums.of(pixels, model), 1e-4
     cost = sums.cost + float(held @ model.numbers() ** 2)
@@ -245,9 +243,7 @@ def _trial(
     """Take one damped step of at most 3 px from `numbers` (p,), with priors of the weights `held` (p,).
 
     The normal equations have the matrix (p, p) and vector (p,); damping is added to the diagonal of the scaled matrix.
-
-    Returns:
-        The new parameters, and the step's largest change of the shape and of sigma, px.
+    Returns the new parameters, and the step's largest change of the shape and of sigma, px.
     """
     step = _step(matrix, vector, held, numbers, damping)
     largest = largest_size(step[:SHAPE])

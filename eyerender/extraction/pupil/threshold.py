@@ -19,11 +19,8 @@ def threshold_pupil(found: PupilCandidate, filled: bool) -> Ellipse | None:
 
     Of the connected regions in the square of REACH about the boundary, the one with most pixels inside it counts. Lids
     and reflections at the rim cut it, and lashes or shadows that touch the pupil belong to it; if `filled`, reflections
-    that it encloses do, too.
-
-    Returns:
-        The ellipse with the region's centre of mass, its area in pixels (pi a b) and the orientation and ratio of axes
-        of its second moments; None if no pixel inside the boundary is beyond the threshold.
+    that it encloses do, too. Returns the ellipse with the region's centre of mass, its area in pixels (pi a b) and the
+    orientation and ratio of axes of its second moments; None if no pixel inside the boundary is beyond the threshold.
     """
     outline, linear = found.boundary.ellipse, found.image.linear
     columns, rows = around(outline.centre_px, REACH * float(outline.semi_axes_px[0]), linear.shape)
