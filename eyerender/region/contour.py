@@ -38,27 +38,16 @@ _WIDE_MM = 2.5  # highest rise of the upper margin's middle above its rest
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Contour(ArrayValue):
-    """Inner edge of the lids, per column.
+    """Inner edge of the lids, per column."""
 
-    Attributes:
-        angle: (n,) angle of the column.
-        along: (n,) coordinate a along the fissure.
-        upper: 1 for the upper lid, -1 for the lower.
-        point: (n, 3) inner edge.
-        normal: (n, 3) normal of the globe or its continuation.
-        away: (n, 3) direction along the globe away from the fissure.
-        along_lid: (n, 3) direction towards the nose.
-        openness: 1 for an upper lid as in straight gaze, 0 for closed lids, above 1 in upward gaze or wide.
-    """
-
-    angle: Floats
-    along: Floats
-    upper: Floats
-    point: Floats
-    normal: Floats
-    away: Floats
-    along_lid: Floats
-    openness: float
+    angle: Floats  # (n,) angle of the column
+    along: Floats  # (n,) coordinate a along the fissure
+    upper: Floats  # 1 for the upper lid, -1 for the lower
+    point: Floats  # (n, 3) inner edge
+    normal: Floats  # (n, 3) normal of the globe or its continuation
+    away: Floats  # (n, 3) direction along the globe away from the fissure
+    along_lid: Floats  # (n, 3) direction towards the nose
+    openness: float  # 1 for an upper lid as in straight gaze, 0 for closed lids, above 1 in upward gaze or wide
 
     def every(self, step: int) -> Contour:
         """Return every `step`-th column, from the first."""

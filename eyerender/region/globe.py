@@ -25,26 +25,16 @@ _WIDEST = np.radians(40.0)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Globe(ArrayValue):
-    """A posed globe.
+    """A posed globe."""
 
-    Attributes:
-        cornea: front of the cornea in the eye frame; None for the bare sphere.
-        limbus_radius_mm: radius of the limbus.
-        centre_mm: (3,) centre of the sphere in the eye frame.
-        radius_mm: radius of the sphere.
-        M: (3, 3) rotation of the motion p = M x + t into the unrotated frame.
-        t: (3,) translation of that motion.
-        mirrored: whether it is a left eye, whose region's frame has y reversed.
-        frames: what holds the lenses worn before it, and obstacles, in the unrotated frame, also for a left eye.
-    """
-
-    cornea: Surface | None
-    limbus_radius_mm: float
-    centre_mm: Floats
-    radius_mm: float
-    M: Floats
-    t: Floats
-    mirrored: bool = False
+    cornea: Surface | None  # front of the cornea in the eye frame; None for the bare sphere
+    limbus_radius_mm: float  # radius of the limbus
+    centre_mm: Floats  # (3,) centre of the sphere in the eye frame
+    radius_mm: float  # radius of the sphere
+    M: Floats  # (3, 3) rotation of the motion p = M x + t into the unrotated frame
+    t: Floats  # (3,) translation of that motion
+    mirrored: bool = False  # whether it is a left eye, whose region's frame has y reversed
+    # what holds the lenses worn before it, and obstacles, in the unrotated frame, also for a left eye
     frames: tuple[Body, ...] = ()
 
     def __post_init__(self) -> None:

@@ -50,37 +50,24 @@ _HAIR_GLOSS = 0.12
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class HeadMesh(ArrayValue):
-    """A head about its own origin, mm, with +x in the direction of the face, +y to its left, +z up.
+    """A head about its own origin, mm, with +x in the direction of the face, +y to its left, +z up."""
 
-    Attributes:
-        vertices: (n, 3) positions, mm.
-        normals: (n, 3) unit normals.
-        faces: (m, 3) indices of vertices.
-        uv: (n, 2) texture coordinates; NaN if the file has none.
-        vertex_ends: end index of each part's vertices, in the order of `HEAD_PARTS`.
-        face_ends: end index of each part's faces.
-        right_eye: (3,) centre of the right globe; NaN if not given.
-        left_eye: (3,) centre of the left globe; NaN if not given.
-    """
-
-    vertices: Floats
-    normals: Floats
-    faces: Ints
-    uv: Floats
-    vertex_ends: Ints
-    face_ends: Ints
-    right_eye: Floats
-    left_eye: Floats
+    vertices: Floats  # (n, 3) positions, mm
+    normals: Floats  # (n, 3) unit normals
+    faces: Ints  # (m, 3) indices of vertices
+    uv: Floats  # (n, 2) texture coordinates; NaN if the file has none
+    vertex_ends: Ints  # end index of each part's vertices, in the order of `HEAD_PARTS`
+    face_ends: Ints  # end index of each part's faces
+    right_eye: Floats  # (3,) centre of the right globe; NaN if not given
+    left_eye: Floats  # (3,) centre of the left globe; NaN if not given
 
 
 def load_head(spec: Head) -> HeadMesh:
     """Read and check the files of a spec with absolute paths (`Head.resolved`).
 
-    The result is cached until a file changes.
-
-    Raises:
-        InputError: a file is missing, unreadable or has another checksum; a part does not exist; numbers are not
-            finite; the size does not fit the unit; an eye is far away, or the head is turned backwards.
+    The result is cached until a file changes. Raises InputError if a file is missing, unreadable or has another
+    checksum; if a part does not exist; if numbers are not finite; if the size does not fit the unit; if an eye is far
+    away, or the head is turned backwards.
     """
     if spec.manifest:
         raise InputError("is a manifest; call resolve on it first", source=spec.files[0])

@@ -172,19 +172,12 @@ def _furrows(rng: np.random.Generator, s: NDArray[Any], turn: NDArray[Any]) -> S
 
 @dataclass(frozen=True, kw_only=True)
 class _Polar:
-    """Places on the iris, for rows s and columns of the map.
+    """Places on the iris, for rows s and columns of the map."""
 
-    Attributes:
-        s: share of the way from margin to root, (RADIAL, 1).
-        off: s outside of the collarette, (RADIAL, ANGULAR).
-        turn: share of a turn, (1, ANGULAR).
-        warp: how far the fibres swing aside, columns, (RADIAL, ANGULAR).
-    """
-
-    s: NDArray[Any]
-    off: NDArray[Any]
-    turn: NDArray[Any]
-    warp: Singles
+    s: NDArray[Any]  # share of the way from margin to root, (RADIAL, 1)
+    off: NDArray[Any]  # s outside of the collarette, (RADIAL, ANGULAR)
+    turn: NDArray[Any]  # share of a turn, (1, ANGULAR)
+    warp: Singles  # how far the fibres swing aside, columns, (RADIAL, ANGULAR)
 
     def lattice(
         self, rng: np.random.Generator, rows: NDArray[Any], cell_mm: float, long_by: float

@@ -47,23 +47,14 @@ _ON_GLOBE = (1.0, 0.8, 0.5, 0.2)  # share of the globe's normal in those of the 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Sheet(ArrayValue):
-    """The posed sheet.
+    """The posed sheet."""
 
-    Attributes:
-        fine: (FINE + 1, columns, 3) points of the first rows, mm.
-        fine_normals: (FINE + 1, columns, 3) their unit normals.
-        coarse: (ROWS - FINE - 1, columns / 2, 3) points of the other rows, in every second column.
-        coarse_normals: (ROWS - FINE - 1, columns / 2, 3) their unit normals.
-        contour: frame of the lash line.
-        lash_line: (columns, 3) outer edge of the margin.
-    """
-
-    fine: Floats
-    fine_normals: Floats
-    coarse: Floats
-    coarse_normals: Floats
-    contour: Contour
-    lash_line: Floats
+    fine: Floats  # (FINE + 1, columns, 3) points of the first rows, mm
+    fine_normals: Floats  # (FINE + 1, columns, 3) their unit normals
+    coarse: Floats  # (ROWS - FINE - 1, columns / 2, 3) points of the other rows, in every second column
+    coarse_normals: Floats  # (ROWS - FINE - 1, columns / 2, 3) their unit normals
+    contour: Contour  # frame of the lash line
+    lash_line: Floats  # (columns, 3) outer edge of the margin
 
     @property
     def vertices(self) -> Floats:

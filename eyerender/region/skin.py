@@ -337,27 +337,16 @@ def _hollows(behind: Singles, y: Singles, z: Singles) -> Singles:
 
 @dataclass(kw_only=True)
 class _Strip:
-    """Some rows of the map; computes all channels for them except the slopes.
+    """Some rows of the map; computes all channels for them except the slopes."""
 
-    Attributes:
-        tiles: the subject's noise.
-        y: position in the region's frame, mm.
-        z: position in the region's frame, mm.
-        out_mm: distance over the sheet from the lash line.
-        rows: row of the sheet, (rows, 1).
-        turn: angle about the fissure, (1, columns).
-        slow: the slowly varying fields.
-        strip: the rows of the map.
-    """
-
-    tiles: _Tiles
-    y: Singles
-    z: Singles
-    out_mm: Singles
-    rows: Singles
-    turn: Singles
-    slow: _Slow
-    strip: slice
+    tiles: _Tiles  # the subject's noise
+    y: Singles  # position in the region's frame, mm
+    z: Singles  # position in the region's frame, mm
+    out_mm: Singles  # distance over the sheet from the lash line
+    rows: Singles  # row of the sheet, (rows, 1)
+    turn: Singles  # angle about the fissure, (1, columns)
+    slow: _Slow  # the slowly varying fields
+    strip: slice  # the rows of the map
 
     def __post_init__(self) -> None:
         rows, y, z = self.rows, self.y, self.z

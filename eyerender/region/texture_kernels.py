@@ -15,11 +15,8 @@ X, Y, COSINE, SINE, WEIGHT, LEFT, STEPS, LEVEL, COLUMNS = range(9)
 def prune(tips: Floats, draws: Floats, limbus: float, size: int) -> int:
     """Move the tips (n, COLUMNS) that still grow to the front, in their order, and return their number.
 
-    Args:
-        tips: the tips.
-        draws: (n,) random numbers from 0 to 1.
-        limbus: radius of the limbus, pixels.
-        size: side of the map, with the limbus in its middle.
+    `draws`: (n,) random numbers from 0 to 1; `limbus`: radius of the limbus, pixels; `size`: side of the map, with the
+    limbus in its middle.
     """
     count, half = 0, size / 2
     for k in range(len(tips)):
@@ -37,10 +34,7 @@ def prune(tips: Floats, draws: Floats, limbus: float, size: int) -> int:
 def grow(tips: Floats, draws: Floats, layers: Floats) -> None:
     """Move tips (n, COLUMNS) by a step, and add their weights to the layers (3, size, size) of their levels.
 
-    Args:
-        tips: the tips.
-        draws: (n,) random numbers of variance 1.
-        layers: maps of the vessels, the widest first.
+    `draws`: (n,) random numbers of variance 1; `layers`: maps of the vessels, the widest first.
     """
     half = layers.shape[1] / 2
     for k in range(len(tips)):
