@@ -63,22 +63,17 @@ class Renderer:
 
     def begin(
         self,
-        job: RenderJob,
+        job: RenderJob,  # the job to render
         *,
-        spp: int | None = None,
-        moments: Sequence[SubFrames] = (),
+        spp: int | None = None,  # as in `render`
+        moments: Sequence[SubFrames] = (),  # as in `render`
+        # the next job, if known; its host data are then computed in the second thread too. The next call must pass the
+        # same object
         after: RenderJob | None = None,
     ) -> Future[RenderedWindow]:
         """Trace a window now; lens and sensor run in a second thread while the next window is traced.
 
         The result equals that of `render`, whatever comes next.
-
-        Args:
-            job: the job to render.
-            spp: as in `render`.
-            moments: as in `render`.
-            after: the next job, if known; its host data are then computed in the second thread too. The next call must
-                pass the same object.
         """
         return self._beside.submit(self._traced(job, spp, moments, after).develop)
 

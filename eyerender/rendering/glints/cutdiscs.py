@@ -66,10 +66,8 @@ def rim(count: int) -> Nodes:
 def cut_nodes(visible: Visible, radial: int, angular: int) -> Nodes:
     """Compute a quadrature over the visible part of a disc.
 
-    Args:
-        visible: returns whether points (n, 2) of the unit disc are visible.
-        radial: number of circles for the whole disc.
-        angular: number of points for a whole circle.
+    `visible`: returns whether points (n, 2) of the unit disc are visible; `radial`: number of circles for the whole
+    disc; `angular`: number of points for a whole circle.
     """
     s, gauss = _gauss(max(8, radial))
     s, gauss = 0.5 * (s + 1), 0.5 * gauss

@@ -93,12 +93,8 @@ def stack(
 ) -> tuple[tuple[Surface, ...], tuple[float, ...], tuple[float, ...], tuple[bool, ...], GradientMedium | None]:
     """Return the surfaces down to the mirror, with everything needed to trace a ray through them.
 
-    Returns:
-        The surfaces, the indices behind them, their rims, whether a ray may miss them, and the gradient in front of the
-        mirror.
-
-    Raises:
-        InputError: the eye has no such image.
+    Returns the surfaces, the indices behind them, their rims, whether a ray may miss them, and the gradient in front of
+    the mirror. Raises InputError if the eye has no such image.
     """
     if order not in eye.purkinje_orders or order == 1:
         raise InputError(f"{eye.name} has no Purkinje image {order}", path="purkinje")

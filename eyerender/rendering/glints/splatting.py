@@ -74,27 +74,16 @@ class Mirrored:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MirrorImages:
-    """Mirror images of a job's lamps and of the sun, before occlusion.
-
-    Attributes:
-        job: the job.
-        lamps: its lamps, and the sun if there is one.
-        scene: the mirrors.
-        first: images in the front of the cornea.
-        further: requested images of higher orders.
-        nearness: (n, 2) inverse depths (1/mm) of the first images; NaN where not needed.
-        in_lenses: images in worn lenses.
-        ghosts: ghosts of the first images, by the back of a mirror's glass; empty without.
-    """
+    """Mirror images of a job's lamps and of the sun, before occlusion."""
 
     job: RenderJob
-    lamps: tuple[Lamp, ...]
-    scene: GlintScene
-    first: LampImages
-    further: dict[int, list[Image]]
-    nearness: Floats
-    in_lenses: list[Image]
-    ghosts: list[Image]
+    lamps: tuple[Lamp, ...]  # its lamps, and the sun if there is one
+    scene: GlintScene  # the mirrors
+    first: LampImages  # images in the front of the cornea
+    further: dict[int, list[Image]]  # requested images of higher orders
+    nearness: Floats  # (n, 2) inverse depths (1/mm) of the first images; NaN where not needed
+    in_lenses: list[Image]  # images in worn lenses
+    ghosts: list[Image]  # ghosts of the first images, by the back of a mirror's glass; empty without
 
     @classmethod
     def of(cls, job: RenderJob, mesh: SurfaceMesh | None, before: MirrorImages | None = None) -> MirrorImages:
@@ -166,10 +155,8 @@ def _reason(job: RenderJob, place: Background | RegionScene, glint: Glint) -> st
 def glint_reason(there: Bools, open_: Bools, blockers: Sequence[str | None]) -> str:
     """Describe a lamp's mirror image: visible, partly or fully occluded (and mostly by what), or off the cornea.
 
-    Args:
-        there: (k,) whether the cornea mirrors the points of the lamp to the camera.
-        open_: (k,) whether nothing of the scene blocks the point.
-        blockers: (k,) name of the blocking part, None if there is none.
+    `there`: (k,) whether the cornea mirrors the points of the lamp to the camera; `open_`: (k,) whether nothing of the
+    scene blocks the point; `blockers`: (k,) name of the blocking part, None if there is none.
     """
     if not np.any(there):
         return "off the cornea"

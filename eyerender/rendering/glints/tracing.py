@@ -53,19 +53,12 @@ _ROUGH = quadrature(*_LEAST).join(rim(_ON_RIM))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlintTable(ArrayValue):
-    """Visible glints, one row per lamp.
+    """Visible glints, one row per lamp."""
 
-    Attributes:
-        xy_px: (n, 2) energy-weighted position in full-sensor pixels.
-        energy: (n,) radiance times pixels (mW/mm^2/sr px) that reaches the camera.
-        share: (n,) share of the lamp's image that is visible.
-        visible: (n,) whether any of it is.
-    """
-
-    xy_px: Floats
-    energy: Floats
-    share: Floats
-    visible: Bools
+    xy_px: Floats  # (n, 2) energy-weighted position in full-sensor pixels
+    energy: Floats  # (n,) radiance times pixels (mW/mm^2/sr px) that reaches the camera
+    share: Floats  # (n,) share of the lamp's image that is visible
+    visible: Bools  # (n,) whether any of it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,25 +71,15 @@ class LampSpots(ArrayValue):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Image:
-    """A lamp's image, one row per point of the lamp.
+    """A lamp's image, one row per point of the lamp."""
 
-    Attributes:
-        source_mm: (k, 3) points of the lamp, world.
-        entry_mm: (k, 3) where their light enters the eye.
-        exit_mm: (k, 3) where it leaves the eye.
-        xy_px: (k, 2) pixels.
-        energy: (k,) energies, also of points that only a larger cornea would mirror; 0 where no ray is found.
-        there: (k,) whether the eye mirrors the point to the camera.
-        found: (k,) whether the eye, or a larger cornea, mirrors the point to the camera.
-    """
-
-    source_mm: Floats
-    entry_mm: Floats
-    exit_mm: Floats
-    xy_px: Floats
-    energy: Floats
-    there: Bools
-    found: Bools
+    source_mm: Floats  # (k, 3) points of the lamp, world
+    entry_mm: Floats  # (k, 3) where their light enters the eye
+    exit_mm: Floats  # (k, 3) where it leaves the eye
+    xy_px: Floats  # (k, 2) pixels
+    energy: Floats  # (k,) energies, also of points that only a larger cornea would mirror; 0 where no ray is found
+    there: Bools  # (k,) whether the eye mirrors the point to the camera
+    found: Bools  # (k,) whether the eye, or a larger cornea, mirrors the point to the camera
 
     @property
     def spots(self) -> LampSpots:
@@ -106,17 +89,11 @@ class Image:
 
 @dataclass(frozen=True, slots=True)
 class Glint:
-    """A lamp's mirror image, and its part visible to the camera.
+    """A lamp's mirror image, and its part visible to the camera."""
 
-    Attributes:
-        image: image of points of the whole lamp, and of its rim with energy 0.
-        clear: (k,) whether nothing of the scene hides these points.
-        spots: the points that make up the visible part.
-    """
-
-    image: Image
-    clear: Bools
-    spots: LampSpots
+    image: Image  # image of points of the whole lamp, and of its rim with energy 0
+    clear: Bools  # (k,) whether nothing of the scene hides these points
+    spots: LampSpots  # the points that make up the visible part
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,17 +368,11 @@ class GlintScene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Reflections(MirrorPoints):
-    """Points that mirror sources to viewpoints, on the cornea or on its continuation.
+    """Points that mirror sources to viewpoints, on the cornea or on its continuation."""
 
-    Attributes:
-        there: (n,) whether they are on the cornea.
-        meets: (n, 3) directions in which the light meets the cornea.
-        passed: (n,) share of the light that lenses in front of the eye let pass.
-    """
-
-    there: Bools
-    meets: Floats
-    passed: Floats
+    there: Bools  # (n,) whether they are on the cornea
+    meets: Floats  # (n, 3) directions in which the light meets the cornea
+    passed: Floats  # (n,) share of the light that lenses in front of the eye let pass
 
 
 def _one_row(point: Xyz) -> Xyz:
@@ -411,50 +382,29 @@ def _one_row(point: Xyz) -> Xyz:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightPaths:
-    """Light from points of lamps to the camera by way of a mirror, one row per point, in the eye frame.
+    """Light from points of lamps to the camera by way of a mirror, one row per point, in the eye frame."""
 
-    Attributes:
-        entry: (k, 3) where the light enters the eye, mm.
-        exit: (k, 3) where it leaves the eye, mm.
-        arrives: (k, 3) unit direction in which it leaves the lamp.
-        leaves: (k, 3) unit direction in which it arrives at the camera.
-        passed: (k,) share of the light that is mirrored, and not lost at other surfaces.
-        cross_section: (k,) cross section of the ray tube at the lamp per solid angle at the camera, mm^2/sr.
-        found: (k,) whether there is a path, also through a larger cornea.
-        there: (k,) whether there is one through the eye.
-    """
-
-    entry: Floats
-    exit: Floats
-    arrives: Floats
-    leaves: Floats
-    passed: Floats
-    cross_section: Floats
-    found: Bools
-    there: Bools
+    entry: Floats  # (k, 3) where the light enters the eye, mm
+    exit: Floats  # (k, 3) where it leaves the eye, mm
+    arrives: Floats  # (k, 3) unit direction in which it leaves the lamp
+    leaves: Floats  # (k, 3) unit direction in which it arrives at the camera
+    passed: Floats  # (k,) share of the light that is mirrored, and not lost at other surfaces
+    cross_section: Floats  # (k,) cross section of the ray tube at the lamp per solid angle at the camera, mm^2/sr
+    found: Bools  # (k,) whether there is a path, also through a larger cornea
+    there: Bools  # (k,) whether there is one through the eye
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Emitters:
-    """Points of lamps.
+    """Points of lamps."""
 
-    Attributes:
-        points: (k, 3) mm in the world, grouped by lamp.
-        weights: (k,) weights within their lamps.
-        which: (k,) numbers of the lamps.
-        counts: number of points of each lamp.
-        axes: (n, 3) axes of the lamps.
-        strength: (n,) radiant intensities along the axes, mW/sr.
-        exponent: (n,) exponents of the lobes.
-    """
-
-    points: Floats
-    weights: Floats
-    which: NDArray[np.intp]
-    counts: list[int]
-    axes: Floats
-    strength: Floats
-    exponent: Floats
+    points: Floats  # (k, 3) mm in the world, grouped by lamp
+    weights: Floats  # (k,) weights within their lamps
+    which: NDArray[np.intp]  # (k,) numbers of the lamps
+    counts: list[int]  # number of points of each lamp
+    axes: Floats  # (n, 3) axes of the lamps
+    strength: Floats  # (n,) radiant intensities along the axes, mW/sr
+    exponent: Floats  # (n,) exponents of the lobes
 
     @classmethod
     def of(cls, lights: Sequence[Lamp], nodes: Sequence[Nodes]) -> Emitters:

@@ -25,23 +25,14 @@ _FAR = float(np.finfo(np.float32).max)
 
 @dataclass(kw_only=True)
 class EyeHit:
-    """Preliminary hit of a ray on the eye, without what lies behind the surface.
+    """Preliminary hit of a ray on the eye, without what lies behind the surface."""
 
-    Attributes:
-        t: distance, infinite where the ray misses.
-        cornea: whether the ray enters through the clear part of the cornea.
-        sclera: whether it meets the sclera.
-        to_cornea: distance to the cornea from the start near the eye.
-        to_sclera: distance to the sclera from the same start.
-        facing: unit normal of the cornea, in its own frame.
-    """
-
-    t: mi.Float
-    cornea: mi.Bool
-    sclera: mi.Bool
-    to_cornea: mi.Float
-    to_sclera: mi.Float
-    facing: mi.Vector3f
+    t: mi.Float  # distance, infinite where the ray misses
+    cornea: mi.Bool  # whether the ray enters through the clear part of the cornea
+    sclera: mi.Bool  # whether it meets the sclera
+    to_cornea: mi.Float  # distance to the cornea from the start near the eye
+    to_sclera: mi.Float  # distance to the sclera from the same start
+    facing: mi.Vector3f  # unit normal of the cornea, in its own frame
 
 
 @dataclass(kw_only=True)

@@ -21,43 +21,25 @@ _DEEPEST = 0.75  # least inverse depth of the image of an iris, relative to the 
 
 @dataclass(kw_only=True)
 class SurfaceInteraction:
-    """First surface that a ray meets, and the surface behind the cornea. Points and normals are in the eye frame.
+    """First surface that a ray meets, and the surface behind the cornea. Points and normals are in the eye frame."""
 
-    Attributes:
-        cornea: whether the ray enters through the clear part of the cornea.
-        sclera: whether it meets the sclera.
-        other: whether it meets anything of the scene that is not the eye.
-        distance: distance to the first surface, mm.
-        point: point on the first surface.
-        normal: unit normal there.
-        opacity: opacity of the tissue there: 0 clear cornea, 1 sclera.
-        mirrored: reflectance of the front cornea.
-        passed: transmittance of the refracted ray, 0 where it does not reach the plane of the iris.
-        inner: point in the plane of the iris.
-        slant: lateral motion of the ray per mm of height above that plane.
-        pupil: whether the inner point lies in the pupil.
-        albedo: albedo of a surface that is not the eye.
-        gloss: gloss of such a surface, or of the wet sclera.
-        received: light that such a surface receives from other surfaces (see `radiosityfield.RadiosityField`).
-        level: normal without the relief, on skin with subsurface scattering.
-    """
-
-    cornea: mi.Bool
-    sclera: mi.Bool
-    other: mi.Bool
-    distance: mi.Float
-    point: mi.Vector3f
-    normal: mi.Vector3f
-    opacity: mi.Float
-    mirrored: mi.Float
-    passed: mi.Float
-    inner: mi.Vector3f
-    slant: mi.Vector3f
-    pupil: mi.Bool
-    albedo: mi.Float
-    gloss: mi.Float
+    cornea: mi.Bool  # whether the ray enters through the clear part of the cornea
+    sclera: mi.Bool  # whether it meets the sclera
+    other: mi.Bool  # whether it meets anything of the scene that is not the eye
+    distance: mi.Float  # distance to the first surface, mm
+    point: mi.Vector3f  # point on the first surface
+    normal: mi.Vector3f  # unit normal there
+    opacity: mi.Float  # opacity of the tissue there: 0 clear cornea, 1 sclera
+    mirrored: mi.Float  # reflectance of the front cornea
+    passed: mi.Float  # transmittance of the refracted ray, 0 where it does not reach the plane of the iris
+    inner: mi.Vector3f  # point in the plane of the iris
+    slant: mi.Vector3f  # lateral motion of the ray per mm of height above that plane
+    pupil: mi.Bool  # whether the inner point lies in the pupil
+    albedo: mi.Float  # albedo of a surface that is not the eye
+    gloss: mi.Float  # gloss of such a surface, or of the wet sclera
+    # light that such a surface receives from other surfaces (see `radiosityfield.RadiosityField`)
     received: mi.Vector4f
-    level: mi.Vector3f | None = None
+    level: mi.Vector3f | None = None  # normal without the relief, on skin with subsurface scattering
 
     @classmethod
     def blank(cls) -> SurfaceInteraction:

@@ -38,38 +38,23 @@ _PARALLEL = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MirrorPoints:
-    """Points that mirror sources to viewpoints (n, 3), in the eye frame.
+    """Points that mirror sources to viewpoints (n, 3), in the eye frame."""
 
-    Attributes:
-        point: point on the mirror.
-        normal: unit normal there.
-        arrives: unit direction of the light before it is reflected.
-        leaves: unit direction of the light after reflection.
-        cross_section: cross section of the ray tube at the source per solid angle at the viewpoint, (n,) mm^2/sr.
-        found: (n,) whether there is such a point.
-    """
-
-    point: Floats
-    normal: Floats
-    arrives: Floats
-    leaves: Floats
-    cross_section: Floats
-    found: Bools
+    point: Floats  # point on the mirror
+    normal: Floats  # unit normal there
+    arrives: Floats  # unit direction of the light before it is reflected
+    leaves: Floats  # unit direction of the light after reflection
+    cross_section: Floats  # cross section of the ray tube at the source per solid angle at the viewpoint, (n,) mm^2/sr
+    found: Bools  # (n,) whether there is such a point
 
 
 @dataclass(kw_only=True)
 class MeshGeometry:
-    """One surface as a mesh for the kernels, in the surface's own frame (+x outward, mm).
+    """One surface as a mesh for the kernels, in the surface's own frame (+x outward, mm)."""
 
-    Attributes:
-        scene: the mesh.
-        faces: four entries for each triangle, of which the first three are its vertices.
-        vertices: eight numbers per vertex: position, 0, normal, 0.
-    """
-
-    scene: mi.Scene
-    faces: mi.UInt32
-    vertices: mi.Float
+    scene: mi.Scene  # the mesh
+    faces: mi.UInt32  # four entries for each triangle, of which the first three are its vertices
+    vertices: mi.Float  # eight numbers per vertex: position, 0, normal, 0
 
     @classmethod
     def of(cls, name: str, vertices: Floats, normals: Floats, faces: Ints) -> MeshGeometry:
@@ -123,17 +108,14 @@ class MeshGeometry:
 
 
 class SurfaceMesh:
-    """One surface as a mesh, in its own frame (+x outward, mm), on the host in float64.
-
-    Attributes:
-        geometry: the same mesh for the kernels.
-    """
+    """One surface as a mesh, in its own frame (+x outward, mm), on the host in float64."""
 
     def __init__(self, patch: Patch, surface: Surface) -> None:
         self.rotation, self.origin = np.asarray(surface.rotation), np.asarray(surface.origin_mm)
         self.vertices = (patch.vertices - self.origin) @ self.rotation
         self.normals = patch.normals @ self.rotation
         self.faces = np.asarray(patch.faces)
+        # the same mesh for the kernels
         self.geometry = MeshGeometry.of(patch.name, self.vertices, self.normals, self.faces)
 
     def mirrored(self, start: Floats, source: Floats, viewpoint: Floats) -> MirrorPoints:

@@ -110,11 +110,8 @@ class FrameBuilder:
     ) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye; both are valid until the next call.
 
-        Args:
-            job: the job.
-            lit: whether to compute light, not only geometry.
-            after: the job of the next frame, if known.
-            before: a frame a moment ago under the same lamps, whose light from surface to surface is taken over.
+        `lit`: whether to compute light, not only geometry; `after`: the job of the next frame, if known; `before`: a
+        frame a moment ago under the same lamps, whose light from surface to surface is taken over.
         """
         host, surroundings = self._host_data(job)
         region = surroundings if isinstance(surroundings, RegionScene) else None

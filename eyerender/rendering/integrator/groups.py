@@ -58,38 +58,23 @@ class LampTurns:
 
 @dataclass(kw_only=True)
 class PixelGroup:
-    """A group of samples of a pixel, one per lane; j numbers them from 0 to `count`.
+    """A group of samples of a pixel, one per lane; j numbers them from 0 to `count`."""
 
-    Attributes:
-        samples: all samples of the pixel.
-        number: number of the group within its pixel.
-        count: number of samples in the group.
-        hits: hits on the region.
-        first_hit: index of the first of these hits.
-        plain: whether the pixel shows only the sheet of skin, and the group has one hit.
-        wet: whether the pixel may show menisci.
-        halved: whether only half of the samples on the globe are shaded, on behalf of all.
-        turns: turns of the pixel's groups, for light on the region.
-        sample_turns: turns of the pixel's samples, for light on the globe.
-        own_shadows: whether pairs of samples trace their own ray to the group's first lamp near the lids and on hairs,
-            where lashes cast shadows finer than a pixel.
-        sharp: whether every sample does so everywhere, because the lamp is the sun.
-        layered: whether to sum the depths of the parts.
-    """
-
-    samples: Samples
-    number: mi.UInt32
-    count: mi.UInt32
-    hits: HitTable
-    first_hit: mi.UInt32
-    plain: mi.Bool
-    wet: mi.Bool
-    halved: mi.Bool
-    turns: LampTurns
-    sample_turns: LampTurns
+    samples: Samples  # all samples of the pixel
+    number: mi.UInt32  # number of the group within its pixel
+    count: mi.UInt32  # number of samples in the group
+    hits: HitTable  # hits on the region
+    first_hit: mi.UInt32  # index of the first of these hits
+    plain: mi.Bool  # whether the pixel shows only the sheet of skin, and the group has one hit
+    wet: mi.Bool  # whether the pixel may show menisci
+    halved: mi.Bool  # whether only half of the samples on the globe are shaded, on behalf of all
+    turns: LampTurns  # turns of the pixel's groups, for light on the region
+    sample_turns: LampTurns  # turns of the pixel's samples, for light on the globe
+    # whether pairs of samples trace their own ray to the group's first lamp near the lids and on hairs, where lashes
+    # cast shadows finer than a pixel
     own_shadows: mi.Bool
-    sharp: mi.Bool
-    layered: bool
+    sharp: mi.Bool  # whether every sample does so everywhere, because the lamp is the sun
+    layered: bool  # whether to sum the depths of the parts
 
     def in_order(self, i: mi.UInt32) -> mi.UInt32:
         """Return the i-th sample to examine: the middle one first, then the others in order."""

@@ -26,23 +26,14 @@ _FAINT = 1e-3  # highlights this weak, relative to the other light or to a white
 
 @dataclass(kw_only=True)
 class GlobeSamples:
-    """Sums over a group's samples on the globe.
+    """Sums over a group's samples on the globe."""
 
-    Attributes:
-        lit: sum of radiance times weight over the shaded samples.
-        shaded: sum of weights of the shaded samples.
-        weight: sum of weights of all samples on the globe.
-        near: sum of weights times inverse depth (1/mm).
-        water: sum of radiance times weight of menisci in front of globe and skin.
-        failures: number of failed light paths.
-    """
-
-    lit: mi.Float
-    shaded: mi.Float
-    weight: mi.Float
-    near: mi.Float
-    water: mi.Float
-    failures: mi.UInt32
+    lit: mi.Float  # sum of radiance times weight over the shaded samples
+    shaded: mi.Float  # sum of weights of the shaded samples
+    weight: mi.Float  # sum of weights of all samples on the globe
+    near: mi.Float  # sum of weights times inverse depth (1/mm)
+    water: mi.Float  # sum of radiance times weight of menisci in front of globe and skin
+    failures: mi.UInt32  # number of failed light paths
 
     @classmethod
     def none(cls) -> GlobeSamples:
@@ -157,19 +148,12 @@ def _globe_radiance(
 
 @dataclass(kw_only=True)
 class _LitPoint:
-    """A surface point lit by lamps (eye frame).
+    """A surface point lit by lamps (eye frame)."""
 
-    Attributes:
-        si: the surface there.
-        normal: normal of the mirroring film.
-        to_camera: unit direction to the viewer.
-        spot: position on the lamps' discs, [0, 1)^2.
-    """
-
-    si: SurfaceInteraction
-    normal: mi.Vector3f
-    to_camera: mi.Vector3f
-    spot: mi.Point2f
+    si: SurfaceInteraction  # the surface there
+    normal: mi.Vector3f  # normal of the mirroring film
+    to_camera: mi.Vector3f  # unit direction to the viewer
+    spot: mi.Point2f  # position on the lamps' discs, [0, 1)^2
 
     def source(self, lamp: DeviceLamp) -> mi.Vector3f:
         """Return the point of a lamp from which light arrives."""

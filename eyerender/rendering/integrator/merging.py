@@ -22,46 +22,27 @@ _LIDS_MM = 18.0  # radius about the axis of the unrotated eye: the region of the
 
 @dataclass(kw_only=True)
 class WeightedHit:
-    """A sample's weighted hit on the region.
+    """A sample's weighted hit on the region."""
 
-    Attributes:
-        j: number of the sample in its group.
-        hit: the hit.
-        on_sheet: whether it lies on the sheet of skin.
-        weight: weight of the sample.
-        near: weight times inverse depth (1/mm).
-        own_ray: whether the sample traces its own ray to the lamp instead of sharing the group's.
-    """
-
-    j: mi.UInt32
+    j: mi.UInt32  # number of the sample in its group
     hit: TriangleHit
-    on_sheet: mi.Bool
-    weight: mi.Float
-    near: mi.Float
-    own_ray: mi.Bool
+    on_sheet: mi.Bool  # whether it lies on the sheet of skin
+    weight: mi.Float  # weight of the sample
+    near: mi.Float  # weight times inverse depth (1/mm)
+    own_ray: mi.Bool  # whether the sample traces its own ray to the lamp instead of sharing the group's
 
 
 @dataclass(kw_only=True)
 class RegionSample:
-    """The surface point that represents all samples of a group on one kind of surface.
+    """The surface point that represents all samples of a group on one kind of surface."""
 
-    Attributes:
-        j: number of its sample.
-        face: its triangle.
-        uv: barycentric coordinates on it.
-        weight: sum of weights of the samples.
-        shared: sum of weights of the samples that share the group's ray to the lamp.
-        clear: sum of weights of the other samples that see the lamp.
-        near: sum of weights times inverse depth (1/mm).
-    """
-
-    j: mi.UInt32
-    face: mi.UInt32
-    uv: mi.Point2f
-    weight: mi.Float
-    shared: mi.Float
-    clear: mi.Float
-    near: mi.Float
+    j: mi.UInt32  # number of its sample
+    face: mi.UInt32  # its triangle
+    uv: mi.Point2f  # barycentric coordinates on it
+    weight: mi.Float  # sum of weights of the samples
+    shared: mi.Float  # sum of weights of the samples that share the group's ray to the lamp
+    clear: mi.Float  # sum of weights of the other samples that see the lamp
+    near: mi.Float  # sum of weights times inverse depth (1/mm)
 
     @classmethod
     def none(cls) -> RegionSample:

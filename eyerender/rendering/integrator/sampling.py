@@ -37,21 +37,13 @@ _TIMES, _ENOUGH = 3, 32  # times as many samples at hairs, unless a pixel has mo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmRequest:
-    """A window of a frame and its samples.
+    """A window of a frame and its samples."""
 
-    Attributes:
-        bound: the frame.
-        window: (x0, y0, width, height) in full-sensor pixels.
-        spp: samples per pixel.
-        seed: seed of the samples.
-        layered: whether to render the parts of the scene separately, with their depths.
-    """
-
-    bound: BoundFrame
-    window: Window
-    spp: int
-    seed: int
-    layered: bool
+    bound: BoundFrame  # the frame
+    window: Window  # (x0, y0, width, height) in full-sensor pixels
+    spp: int  # samples per pixel
+    seed: int  # seed of the samples
+    layered: bool  # whether to render the parts of the scene separately, with their depths
 
     @property
     def group_size(self) -> int:
@@ -120,16 +112,11 @@ class Pattern:
 
     A step is the lattice's generator over its number, in units of 2^-32. Integer overflow then replaces the remainder,
     which processors can only compute one lane at a time.
-
-    Attributes:
-        usual: number and step of the ordinary lattice.
-        fine: number and step of the lattice of supersampled pixels.
-        keys: keys of the further random numbers.
     """
 
-    usual: tuple[mi.UInt32, mi.UInt32]
-    fine: tuple[mi.UInt32, mi.UInt32]
-    keys: tuple[mi.UInt32, ...]
+    usual: tuple[mi.UInt32, mi.UInt32]  # number and step of the ordinary lattice
+    fine: tuple[mi.UInt32, mi.UInt32]  # number and step of the lattice of supersampled pixels
+    keys: tuple[mi.UInt32, ...]  # keys of the further random numbers
 
     @classmethod
     def of(cls, count: int, seed: int, *, times: int = 1) -> Pattern:
@@ -144,21 +131,13 @@ class Pattern:
 
 @dataclass(kw_only=True)
 class Samples:
-    """Samples of pixels, one pixel per lane. They do not depend on the window.
+    """Samples of pixels, one pixel per lane. They do not depend on the window."""
 
-    Attributes:
-        u: column of the pixel on the sensor.
-        v: row of the pixel on the sensor.
-        count: number of samples.
-        step: step of the lattice, as in `Pattern`.
-        keys: as in `Pattern`.
-    """
-
-    u: mi.Int32
-    v: mi.Int32
-    count: mi.UInt32
-    step: mi.UInt32
-    keys: tuple[mi.UInt32, ...]
+    u: mi.Int32  # column of the pixel on the sensor
+    v: mi.Int32  # row of the pixel on the sensor
+    count: mi.UInt32  # number of samples
+    step: mi.UInt32  # step of the lattice, as in `Pattern`
+    keys: tuple[mi.UInt32, ...]  # as in `Pattern`
 
     @classmethod
     def of(cls, u: mi.Int32, v: mi.Int32, pattern: Pattern, fine: mi.Bool | bool = False) -> Samples:

@@ -24,29 +24,17 @@ TILE = 4  # pixels across and down of a tile, whose groups are shaded together
 
 @dataclass(kw_only=True)
 class GroupPass:
-    """Sample groups that one pass takes of each pixel of a window.
+    """Sample groups that one pass takes of each pixel of a window."""
 
-    Attributes:
-        first: number of the first group.
-        count: number of groups.
-        total: number of groups of a pixel in all passes.
-        size: samples of a group.
-        times: factor for the size in supersampled pixels.
-        pixels: the window.
-        height: its height.
-        tiles: number of tiles across.
-        own_shadows: as in `PixelGroup`.
-    """
-
-    first: mi.UInt32
-    count: mi.UInt32
-    total: mi.UInt32
-    size: mi.UInt32
-    times: mi.UInt32
-    pixels: Pixels
-    height: mi.UInt32
-    tiles: mi.UInt32
-    own_shadows: mi.Bool
+    first: mi.UInt32  # number of the first group
+    count: mi.UInt32  # number of groups
+    total: mi.UInt32  # number of groups of a pixel in all passes
+    size: mi.UInt32  # samples of a group
+    times: mi.UInt32  # factor for the size in supersampled pixels
+    pixels: Pixels  # the window
+    height: mi.UInt32  # its height
+    tiles: mi.UInt32  # number of tiles across
+    own_shadows: mi.Bool  # as in `PixelGroup`
 
     @classmethod
     def upload(cls, request: FilmRequest, first: int, count: int, *, own_shadows: bool) -> GroupPass:
@@ -62,17 +50,11 @@ class GroupPass:
 
 @dataclass(kw_only=True)
 class HitTable:
-    """Hits on an eye region of all samples of a pass.
+    """Hits on an eye region of all samples of a pass."""
 
-    Attributes:
-        marks: class of each pixel of the window, as in `HostData.marks`.
-        first: index of the first hit of each pixel.
-        hits: the hits, those of a pixel side by side.
-    """
-
-    marks: mi.UInt8
-    first: mi.UInt32
-    hits: TriangleHit
+    marks: mi.UInt8  # class of each pixel of the window, as in `HostData.marks`
+    first: mi.UInt32  # index of the first hit of each pixel
+    hits: TriangleHit  # the hits, those of a pixel side by side
 
     def at(self, i: mi.UInt32) -> TriangleHit:
         """Read hit `i`."""
@@ -83,19 +65,12 @@ class HitTable:
 
 @dataclass(kw_only=True)
 class _Lanes:
-    """Lanes with one sample each, ordered by the classes of their pixels.
+    """Lanes with one sample each, ordered by the classes of their pixels."""
 
-    Attributes:
-        lane: numbers of the lanes.
-        order: the pixels: supersampled ones, ordinary ones, and those that show only skin.
-        pixel_ends: ends of the first two classes in `order`.
-        lane_ends: their ends in `lane`.
-    """
-
-    lane: mi.UInt32
-    order: mi.UInt32
-    pixel_ends: tuple[mi.UInt32, mi.UInt32]
-    lane_ends: tuple[mi.UInt32, mi.UInt32]
+    lane: mi.UInt32  # numbers of the lanes
+    order: mi.UInt32  # the pixels: supersampled ones, ordinary ones, and those that show only skin
+    pixel_ends: tuple[mi.UInt32, mi.UInt32]  # ends of the first two classes in `order`
+    lane_ends: tuple[mi.UInt32, mi.UInt32]  # their ends in `lane`
 
     def samples(self, groups: GroupPass) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
         """Return the pixel and the number of each lane's sample, and whether the pixel is supersampled."""

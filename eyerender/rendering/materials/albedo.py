@@ -22,19 +22,12 @@ STEEPEST = 1.5  # slope of the opacity of the cornea's rim where it is steepest,
 
 @dataclass(kw_only=True)
 class Textures:
-    """Maps of the eye.
+    """Maps of the eye."""
 
-    Attributes:
-        iris: relative albedo (mean 1) of the iris over (angle, pupil to root).
-        heights: height (mm) of the iris over the same coordinates.
-        raised: whether the iris has any heights.
-        sclera: relative albedo of the sclera.
-    """
-
-    iris: mi.Texture2f
-    heights: mi.Texture2f
-    raised: bool
-    sclera: mi.Texture2f
+    iris: mi.Texture2f  # relative albedo (mean 1) of the iris over (angle, pupil to root)
+    heights: mi.Texture2f  # height (mm) of the iris over the same coordinates
+    raised: bool  # whether the iris has any heights
+    sclera: mi.Texture2f  # relative albedo of the sclera
 
     @classmethod
     def of(cls, look: Look) -> Textures:

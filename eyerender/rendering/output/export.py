@@ -104,10 +104,7 @@ def export_scene(
 def bake_meshes(eye: EyeModel, folder: str | Path, *, rings: int = 24, sectors: int = 96) -> Path:
     """Write every patch of an eye as PLY, and describe them in `manifest.json`.
 
-    The manifest states meaning, unit, frame, licence, refractive indices and SHA-256.
-
-    Returns:
-        The path of the manifest.
+    The manifest states meaning, unit, frame, licence, refractive indices and SHA-256. Returns the path of the manifest.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

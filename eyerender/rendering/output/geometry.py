@@ -44,20 +44,15 @@ _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Geometry(ArrayValue):
-    """What the centres of pixels show; NaN where there is none, None where a kind was not requested.
+    """What the centres of pixels show; NaN where there is none, None where a kind was not requested."""
 
-    Attributes:
-        depth: (height, width) mm along the camera's axis to the first surface; along the ray of a fisheye.
-        normals: (height, width, 3) its unit normals, in the camera's frame (x right, y down, z forward), to the camera.
-        iris_coordinates: (height, width, 2) mm toward the nose and up in the plane of the iris, from the centre of the
-            stop, of what the pixel shows through the cornea.
-        instances: (height, width) parts of the eye as in a mask, or `SKIN`, `UPPER_LID`, ...
-    """
-
-    depth: Singles | None
+    depth: Singles | None  # (height, width) mm along the camera's axis to the first surface; along the ray of a fisheye
+    # (height, width, 3) its unit normals, in the camera's frame (x right, y down, z forward), to the camera
     normals: Singles | None
+    # (height, width, 2) mm toward the nose and up in the plane of the iris, from the centre of the stop, of what the
+    # pixel shows through the cornea
     iris_coordinates: Singles | None
-    instances: Bytes
+    instances: Bytes  # (height, width) parts of the eye as in a mask, or `SKIN`, `UPPER_LID`, ...
 
     def behind(self, covered: Bools) -> Geometry:
         """Return it where what frames the camera's view covers the pixels (height, width)."""
@@ -72,32 +67,20 @@ class Geometry(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Hits(ArrayValue):
-    """Hits of the rays through the n centres of pixels, in the eye's frame; None where no kind needs them.
+    """Hits of the rays through the n centres of pixels, in the eye's frame; None where no kind needs them."""
 
-    Attributes:
-        point: (3, n) mm.
-        normal: (3, n) unit normals of the surface without its relief, toward the camera.
-        inner: (3, n) mm in the plane of the iris.
-        labels: raster labels of the window, those of `part_labels`.
-        instance: (n,) code of the instance.
-        cornea: (n,) whether the cornea is met, also where its rim is opaque.
-    """
-
-    point: Singles | None
-    normal: Singles | None
-    inner: Singles | None
-    labels: PartLabels
-    instance: Bytes
-    cornea: Bools
+    point: Singles | None  # (3, n) mm
+    normal: Singles | None  # (3, n) unit normals of the surface without its relief, toward the camera
+    inner: Singles | None  # (3, n) mm in the plane of the iris
+    labels: PartLabels  # raster labels of the window, those of `part_labels`
+    instance: Bytes  # (n,) code of the instance
+    cornea: Bools  # (n,) whether the cornea is met, also where its rim is opaque
 
 
 def window_hits(bound: BoundFrame, job: RenderJob, scene: object) -> Callable[[], Hits]:
     """Begin to find what the centres of a window's pixels show; the result waits for it.
 
-    Args:
-        bound: the frame.
-        job: its job, whose kinds of geometry are wanted.
-        scene: the surroundings of the eye.
+    `bound`: the frame; `job`: its job, whose kinds of geometry are wanted; `scene`: the surroundings of the eye.
     """
     shape = job.window[3], job.window[2]
     codes = mi.UInt8(aligned_copy(_codes(scene))) if isinstance(scene, RegionScene) else None

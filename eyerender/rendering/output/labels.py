@@ -30,17 +30,13 @@ _BESIDE_PX = (0.011, 0.007)  # wider than the gap between triangles in single pr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels(ArrayValue):
-    """Part at each pixel's centre, seen through the cornea; arrays (height, width).
+    """Part at each pixel's centre, seen through the cornea; arrays (height, width)."""
 
-    Attributes:
-        part: 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view and obstacles, 5
-            frame of spectacles.
-        amodal: the same for the eye alone, without occluders.
-        annotated: as people draw masks, behind lids but not behind lashes and brow; None if it was not requested.
-    """
-
+    # 0 background or skin, 1 sclera, 2 iris, 3 pupil, 4 frame around the camera's view and obstacles, 5 frame of
+    # spectacles
     part: Bytes
-    amodal: Bytes
+    amodal: Bytes  # the same for the eye alone, without occluders
+    # as people draw masks, behind lids but not behind lashes and brow; None if it was not requested
     annotated: Bytes | None = None
 
     def behind(self, covered: Bools) -> PartLabels:

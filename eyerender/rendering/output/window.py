@@ -24,37 +24,23 @@ from .labels import PartLabels
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RenderedWindow(ArrayValue):
-    """A rendered window.
+    """A rendered window."""
 
-    Attributes:
-        window: (x0, y0, width, height) in full-sensor pixels.
-        irradiance: (height, width) W/m^2 of the sensor.
-        dn: (height, width) digital numbers of the sensor.
-        bit_depth: bits of `dn`.
-        labels: raster labels, if they or geometry were requested.
-        glints: the glints, the mirror images of order 1.
-        purkinje: (order, table) of the other mirror images that were requested.
-        failed_paths: number of light paths that did not converge; they are missing from the irradiance.
-        glint_reasons: for each glint, whether it is visible or what hides it.
-        lid_margins_px: landmarks along the lids, where there are any.
-        highlights: (height, width) pixels with highlights of wet and oily surfaces, if they were requested.
-        geometry: depth, normals, coordinates on the iris and instances, if they were requested.
-        lens_reflections: (height, width) pixels where worn lenses mirror more light than comes from behind them, before
-            glare and sensor; None without lenses.
-    """
-
-    window: Window
-    irradiance: Singles
-    dn: NDArray[np.uint16]
-    bit_depth: int
-    labels: PartLabels | None
-    glints: GlintTable
-    purkinje: tuple[tuple[int, GlintTable], ...]
-    failed_paths: int
-    glint_reasons: tuple[str, ...] = ()
-    lid_margins_px: dict[str, list[list[float]]] | None = None
+    window: Window  # (x0, y0, width, height) in full-sensor pixels
+    irradiance: Singles  # (height, width) W/m^2 of the sensor
+    dn: NDArray[np.uint16]  # (height, width) digital numbers of the sensor
+    bit_depth: int  # bits of `dn`
+    labels: PartLabels | None  # raster labels, if they or geometry were requested
+    glints: GlintTable  # the glints, the mirror images of order 1
+    purkinje: tuple[tuple[int, GlintTable], ...]  # (order, table) of the other mirror images that were requested
+    failed_paths: int  # number of light paths that did not converge; they are missing from the irradiance
+    glint_reasons: tuple[str, ...] = ()  # for each glint, whether it is visible or what hides it
+    lid_margins_px: dict[str, list[list[float]]] | None = None  # landmarks along the lids, where there are any
+    # (height, width) pixels with highlights of wet and oily surfaces, if they were requested
     highlights: Bools | None = None
-    geometry: Geometry | None = None
+    geometry: Geometry | None = None  # depth, normals, coordinates on the iris and instances, if they were requested
+    # (height, width) pixels where worn lenses mirror more light than comes from behind them, before glare and sensor;
+    # None without lenses
     lens_reflections: Bools | None = None
 
     def flipped(self, camera: PinholeCamera) -> RenderedWindow:
@@ -82,46 +68,28 @@ class RenderedWindow(ArrayValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposed(ArrayValue):
-    """Light of one exposure.
+    """Light of one exposure."""
 
-    Attributes:
-        picture: mean radiance of the pixels, with the border that the lens needs, or its parts.
-        glints: light of the lamps' mirror images.
-        rows: (height,) share of the exposure of each row; None: all of it.
-    """
-
-    picture: Singles
-    glints: tuple[Shine, ...]
-    rows: Floats | None = None
+    picture: Singles  # mean radiance of the pixels, with the border that the lens needs, or its parts
+    glints: tuple[Shine, ...]  # light of the lamps' mirror images
+    rows: Floats | None = None  # (height,) share of the exposure of each row; None: all of it
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RawFrame(ArrayValue):
-    """A traced frame before lens and sensor are applied.
+    """A traced frame before lens and sensor are applied."""
 
-    Attributes:
-        job: the frame's job.
-        exposed: the light of the frame, in parts of the exposure if its rows differ.
-        blur: defocus of the job.
-        mirrored: positions and energies of the glints.
-        labels: raster labels, if they or geometry were requested.
-        failed: number of light paths that did not converge.
-        lid_margins_px: landmarks along the lids, where there are any.
-        highlights: (height, width) highlights of wet and oily surfaces, if they were requested.
-        hits: hits of the rays through the centres of pixels, if geometry was requested.
-        around: mean radiance of the whole sensor in blocks (`coarse_sensor`), where light from there strays into the
-            window; else None.
-    """
-
-    job: RenderJob
-    exposed: tuple[Exposed, ...]
-    blur: Blur
-    mirrored: Mirrored
-    labels: PartLabels | None
-    failed: int
-    lid_margins_px: dict[str, list[list[float]]] | None
-    highlights: Bools | None
-    hits: Hits | None = None
+    job: RenderJob  # the frame's job
+    exposed: tuple[Exposed, ...]  # the light of the frame, in parts of the exposure if its rows differ
+    blur: Blur  # defocus of the job
+    mirrored: Mirrored  # positions and energies of the glints
+    labels: PartLabels | None  # raster labels, if they or geometry were requested
+    failed: int  # number of light paths that did not converge
+    lid_margins_px: dict[str, list[list[float]]] | None  # landmarks along the lids, where there are any
+    highlights: Bools | None  # (height, width) highlights of wet and oily surfaces, if they were requested
+    hits: Hits | None = None  # hits of the rays through the centres of pixels, if geometry was requested
+    # mean radiance of the whole sensor in blocks (`coarse_sensor`), where light from there strays into the window; else
+    # None
     around: Singles | None = None
 
     def develop(self) -> RenderedWindow:

@@ -76,29 +76,17 @@ def sequence(k: mi.UInt32, shift: tuple[Any, Any] = (0, 0)) -> tuple[mi.Float, m
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """Plain values that select the compiled kernels.
+    """Plain values that select the compiled kernels."""
 
-    Attributes:
-        surfaces: (kind, tilted) of each refracting surface.
-        distorted: whether the camera's lens distorts.
-        measured_falloff: whether the lens' fall-off is measured, so that rays have no weights.
-        obstacles: whether anything can block light; the background's plane alone cannot.
-        region: whether the eye has a region instead of a background.
-        ambient: whether there is light other than that of the lamps.
-        scattering: whether skin and sclera have subsurface scattering.
-        lenses: kinds of front and back of the lenses worn, from outside inwards.
-        lit_through: whether the lamps light the eye through the lenses; None if some do.
-    """
-
-    surfaces: tuple[tuple[Kind, bool], ...]
-    distorted: bool = False
-    measured_falloff: bool = False
-    obstacles: bool = True
-    region: bool = False
-    ambient: bool = False
-    scattering: bool = False
-    lenses: tuple[tuple[Kind, Kind], ...] = ()
-    lit_through: bool | None = False
+    surfaces: tuple[tuple[Kind, bool], ...]  # (kind, tilted) of each refracting surface
+    distorted: bool = False  # whether the camera's lens distorts
+    measured_falloff: bool = False  # whether the lens' fall-off is measured, so that rays have no weights
+    obstacles: bool = True  # whether anything can block light; the background's plane alone cannot
+    region: bool = False  # whether the eye has a region instead of a background
+    ambient: bool = False  # whether there is light other than that of the lamps
+    scattering: bool = False  # whether skin and sclera have subsurface scattering
+    lenses: tuple[tuple[Kind, Kind], ...] = ()  # kinds of front and back of the lenses worn, from outside inwards
+    lit_through: bool | None = False  # whether the lamps light the eye through the lenses; None if some do
 
 
 @dataclass(kw_only=True)
@@ -112,56 +100,34 @@ class Caches:
 
     Their classes are in `transport/`. `FrameBuilder` builds them in this order, because later ones use earlier ones.
     Only the frame refers to them, so their modules do not depend on each other.
-
-    Attributes:
-        shadow_maps: where a lamp certainly reaches skin (`shadowmaps.ShadowMaps`).
-        diffusion: subsurface light of skin and sclera (`diffusion.DiffusedLight`).
-        ambience: light from the panels and the environment map (`environment.Ambience`).
-        iris: irradiance of the lamps in the plane of the iris (`irisirradiance.IrisIrradiance`).
-        relief: relief mapping of the iris in the light of the lamps (`reliefmapping.IrisRelief`).
-        fundus: lamp light returned by the fundus (`fundusirradiance.FundusIrradiance`).
-        radiosity: irradiance from other surfaces (`radiosityfield.RadiosityField`).
-        globe: irradiance of the lamps on a bare globe and the plane around it (`globeirradiance.GlobeIrradiance`).
     """
 
-    shadow_maps: Any = None
-    diffusion: Any = None
-    ambience: Any = None
-    iris: Any = None
-    relief: Any = None
-    fundus: Any = None
-    radiosity: Any = None
+    shadow_maps: Any = None  # where a lamp certainly reaches skin (`shadowmaps.ShadowMaps`)
+    diffusion: Any = None  # subsurface light of skin and sclera (`diffusion.DiffusedLight`)
+    ambience: Any = None  # light from the panels and the environment map (`environment.Ambience`)
+    iris: Any = None  # irradiance of the lamps in the plane of the iris (`irisirradiance.IrisIrradiance`)
+    relief: Any = None  # relief mapping of the iris in the light of the lamps (`reliefmapping.IrisRelief`)
+    fundus: Any = None  # lamp light returned by the fundus (`fundusirradiance.FundusIrradiance`)
+    radiosity: Any = None  # irradiance from other surfaces (`radiosityfield.RadiosityField`)
+    # irradiance of the lamps on a bare globe and the plane around it (`globeirradiance.GlobeIrradiance`)
     globe: Any = None
 
 
 @dataclass(kw_only=True)
 class DeviceFrame(FrameParameters):
-    """A frame on the device: its parameters, and everything else that kernels read.
+    """A frame on the device: its parameters, and everything else that kernels read."""
 
-    Attributes:
-        structure: selects the kernels.
-        boundary: the shape of the pupil's boundary.
-        lights: the lamps (`Lights`).
-        textures: the maps of the eye (`albedo.Textures`).
-        region: the eye region (`region.SkinGeometry`), if there is one.
-        background: surroundings of an eye without a region (`background.BackgroundGeometry`).
-        caches: light computed before the samples.
-        scene: Mitsuba scene of everything except the eye.
-        lenses: worn lenses in the scene's frame, from outside inwards.
-        turned_lenses: the same in the eye's frame.
-    """
-
-    structure: Structure
-    boundary: PupilBoundary
+    structure: Structure  # selects the kernels
+    boundary: PupilBoundary  # the shape of the pupil's boundary
     surfaces: tuple[DeviceSurface, ...]
-    caches: Caches
-    lights: Any = None
-    textures: Any = None
-    region: Any = None
-    background: Any = None
-    scene: Any = None
-    lenses: tuple[DeviceLens, ...] = ()
-    turned_lenses: tuple[DeviceLens, ...] = ()
+    caches: Caches  # light computed before the samples
+    lights: Any = None  # the lamps (`Lights`)
+    textures: Any = None  # the maps of the eye (`albedo.Textures`)
+    region: Any = None  # the eye region (`region.SkinGeometry`), if there is one
+    background: Any = None  # surroundings of an eye without a region (`background.BackgroundGeometry`)
+    scene: Any = None  # Mitsuba scene of everything except the eye
+    lenses: tuple[DeviceLens, ...] = ()  # worn lenses in the scene's frame, from outside inwards
+    turned_lenses: tuple[DeviceLens, ...] = ()  # the same in the eye's frame
 
     @classmethod
     def upload(
@@ -242,15 +208,10 @@ HARMONICS = 32  # largest number of coefficients of the pupil's boundary
 
 @dataclass(kw_only=True)
 class PupilBoundary:
-    """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), with f the angle in the stop's plane.
+    """The pupil's boundary: relative radius r(f) = 1 + Re sum_k z_k e^(i k f), with f the angle in the stop's plane."""
 
-    Attributes:
-        count: number of coefficients z_k; 0 for an ellipse, which costs no time.
-        waves: the real and imaginary parts of the z_k, k from 1.
-    """
-
-    count: mi.UInt32
-    waves: mi.Float
+    count: mi.UInt32  # number of coefficients z_k; 0 for an ellipse, which costs no time
+    waves: mi.Float  # the real and imaginary parts of the z_k, k from 1
 
     @classmethod
     def upload(cls, waves: Floats) -> PupilBoundary:
@@ -275,19 +236,12 @@ class PupilBoundary:
 
 @dataclass(kw_only=True)
 class Lights:
-    """The lamps in the eye frame, in one buffer, so kernels do not depend on their number.
+    """The lamps in the eye frame, in one buffer, so kernels do not depend on their number."""
 
-    Attributes:
-        count: number of lamps.
-        suns: 1 if the last lamp is a sun with sharp shadows, else 0.
-        rows: the numbers of the lamps, as in `LampTable`; the last one is 1 for lamps whose light passes lenses.
-        lenses: worn lenses in the eye's frame.
-    """
-
-    count: mi.UInt32
-    suns: mi.UInt32
-    rows: mi.Float
-    lenses: tuple[DeviceLens, ...] = ()
+    count: mi.UInt32  # number of lamps
+    suns: mi.UInt32  # 1 if the last lamp is a sun with sharp shadows, else 0
+    rows: mi.Float  # the numbers of the lamps, as in `LampTable`; the last one is 1 for lamps whose light passes lenses
+    lenses: tuple[DeviceLens, ...] = ()  # worn lenses in the eye's frame
 
     @classmethod
     def upload(cls, table: LampTable, lenses: tuple[DeviceLens, ...] = (), through: Bools | bool = False) -> Lights:

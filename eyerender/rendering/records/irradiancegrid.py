@@ -24,17 +24,12 @@ Held = Callable[..., Any]  # (lamp, cell, allowed difference) -> mi.Bool
 
 @dataclass(kw_only=True)
 class IrradianceGrid:
-    """Irradiance (mW/mm^2) in the cells between `side` by `side` nodes.
+    """Irradiance (mW/mm^2) in the cells between `side` by `side` nodes."""
 
-    Attributes:
-        side: number of nodes along a side.
-        cells: irradiance at the sixteen nodes around each cell, row by row, summed over the lamps that the cell holds.
-        left: bit l of a cell is set if it lacks lamp l. With more than 32 lamps, a cell lacks all or none.
-    """
-
-    side: int
+    side: int  # number of nodes along a side
+    # irradiance at the sixteen nodes around each cell, row by row, summed over the lamps that the cell holds
     cells: mi.Float
-    left: mi.UInt32
+    left: mi.UInt32  # bit l of a cell is set if it lacks lamp l. With more than 32 lamps, a cell lacks all or none
 
     @classmethod
     def unknown(cls, side: int) -> IrradianceGrid:

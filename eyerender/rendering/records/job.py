@@ -60,60 +60,35 @@ _GLOBE_CENTRE_MM = np.array([-13.5, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RenderJob(ArrayValue):
-    """One window of one exposure to render.
-
-    Attributes:
-        eye: the eye.
-        M: (3, 3) rotation of its rigid motion x_world = M x + t.
-        t: (3,) translation of that motion, mm.
-        camera: the camera.
-        window: (x0, y0, width, height) in full-sensor pixels.
-        sensor: the sensor.
-        look: albedos and textures.
-        wavelength_nm: wavelength in vacuum.
-        seed: seed of samples and noise.
-        labels: whether to compute raster labels.
-        highlights: whether to find the highlights of wet and oily surfaces.
-        annotated: whether to compute the mask that people would draw.
-        geometry: kinds of geometry to find: depth, normals, iris_coordinates, instances.
-        flip: whether to turn the window left to right in the end; camera and window are those before.
-        purkinje: mirror images of the lamps to show, from 1 (the glint) to 4.
-        apex_mm: (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from
-            a turn about a point 13.5 mm behind the apex.
-        region: the eye region; None for the bare eye.
-        posed: the region's mesh, where moments of an exposure share it; None: that of this pose.
-        lens: focus and vignetting.
-        ambient: light other than that of the lamps.
-        focus_dpt: vergence (D) of the point in focus, 1 / its distance in metres.
-        mesh_edge_mm: edge length of meshes that replace the cornea's surfaces; None: closed forms.
-        interreflection: whether surfaces illuminate each other.
-        obstacles: bodies in the world that hide and shade the eye; they send no light to other surfaces.
-    """
+    """One window of one exposure to render."""
 
     eye: EyeModel
-    M: Floats
-    t: Floats
+    M: Floats  # (3, 3) rotation of its rigid motion x_world = M x + t
+    t: Floats  # (3,) translation of that motion, mm
     camera: PinholeCamera
-    window: Window
+    window: Window  # (x0, y0, width, height) in full-sensor pixels
     lights: tuple[Lamp, ...]
     sensor: Sensor = _SENSOR
-    look: Look = _LOOK
-    wavelength_nm: float = 850.0
-    seed: int = 0
-    labels: bool = True
-    purkinje: tuple[int, ...] = (1,)
+    look: Look = _LOOK  # albedos and textures
+    wavelength_nm: float = 850.0  # wavelength in vacuum
+    seed: int = 0  # seed of samples and noise
+    labels: bool = True  # whether to compute raster labels
+    purkinje: tuple[int, ...] = (1,)  # mirror images of the lamps to show, from 1 (the glint) to 4
+    # (3,) apex of the unrotated eye in the world, to which the surround is fixed. By default it follows from a turn
+    # about a point 13.5 mm behind the apex
     apex_mm: Floats | None = None
-    region: Region | None = None
-    posed: RegionMesh | None = None
-    lens: Lens = _LENS
-    ambient: Ambient = _AMBIENT
-    focus_dpt: float = 0.0
-    mesh_edge_mm: float | None = None
-    interreflection: bool = True
-    highlights: bool = False
-    annotated: bool = False
-    geometry: tuple[str, ...] = ()
-    flip: bool = False
+    region: Region | None = None  # the eye region; None for the bare eye
+    posed: RegionMesh | None = None  # the region's mesh, where moments of an exposure share it; None: that of this pose
+    lens: Lens = _LENS  # focus and vignetting
+    ambient: Ambient = _AMBIENT  # light other than that of the lamps
+    focus_dpt: float = 0.0  # vergence (D) of the point in focus, 1 / its distance in metres
+    mesh_edge_mm: float | None = None  # edge length of meshes that replace the cornea's surfaces; None: closed forms
+    interreflection: bool = True  # whether surfaces illuminate each other
+    highlights: bool = False  # whether to find the highlights of wet and oily surfaces
+    annotated: bool = False  # whether to compute the mask that people would draw
+    geometry: tuple[str, ...] = ()  # kinds of geometry to find: depth, normals, iris_coordinates, instances
+    flip: bool = False  # whether to turn the window left to right in the end; camera and window are those before
+    # bodies in the world that hide and shade the eye; they send no light to other surfaces
     obstacles: tuple[Body, ...] = ()
 
     @property
@@ -277,20 +252,14 @@ def _lens_parameters(lens: WornLens) -> LensParameters:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SubFrames(ArrayValue):
-    """Moments of an exposure that share its rows.
+    """Moments of an exposure that share its rows."""
 
-    Attributes:
-        jobs: the jobs, whose pictures have equal weights.
-        rows: (height,) share of the whole exposure of each row of the window; None: all of it.
-        moving: part (x0, y0, width, height) of the sensor beyond which all moments have the same picture under the same
-            lamps; None: they differ everywhere.
-        labelled: (height,) rows whose raster labels the first job gives; None: none.
-    """
-
-    jobs: tuple[RenderJob, ...]
-    rows: Floats | None = None
+    jobs: tuple[RenderJob, ...]  # the jobs, whose pictures have equal weights
+    rows: Floats | None = None  # (height,) share of the whole exposure of each row of the window; None: all of it
+    # part (x0, y0, width, height) of the sensor beyond which all moments have the same picture under the same lamps;
+    # None: they differ everywhere
     moving: Window | None = None
-    labelled: Bools | None = None
+    labelled: Bools | None = None  # (height,) rows whose raster labels the first job gives; None: none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -402,15 +371,10 @@ def sun_lamps(ambient: Ambient, anchor: Floats) -> tuple[Lamp, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LampTable(ArrayValue):
-    """Lamps in the eye frame, on the host.
+    """Lamps in the eye frame, on the host."""
 
-    Attributes:
-        rows: (n, 10) position, axis, radius, intensity, lobe exponent, inner radius.
-        suns: 1 if the last lamp is the sun, else 0.
-    """
-
-    rows: Floats
-    suns: int = 0
+    rows: Floats  # (n, 10) position, axis, radius, intensity, lobe exponent, inner radius
+    suns: int = 0  # 1 if the last lamp is the sun, else 0
 
     @classmethod
     def of(cls, lights: Sequence[Lamp], M: Floats, t: Floats, suns: int = 0) -> LampTable:

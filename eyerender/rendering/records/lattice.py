@@ -24,15 +24,11 @@ _POWERS = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0
 
 
 class Lattice(NamedTuple):
-    """Bicubic lookup table of a measured surface, as stored on the device.
+    """Bicubic lookup table of a measured surface, as stored on the device."""
 
-    Attributes:
-        shape: (R, 1 + Q, cells per mm, cells in a row, 0).
-        table: (n * n * 16,) height above the paraboloid of R: sum_pq a_pq s^p t^q in each cell, with s and t in
-            [0, 1] along y and z. Cells are stored row by row along z, each as a_00, a_01, ...
-    """
-
-    shape: tuple[float, ...]
+    shape: tuple[float, ...]  # (R, 1 + Q, cells per mm, cells in a row, 0)
+    # (n * n * 16,) height above the paraboloid of R: sum_pq a_pq s^p t^q in each cell, with s and t in [0, 1] along y
+    # and z. Cells are stored row by row along z, each as a_00, a_01, ...
     table: NDArray[np.float32]
 
 
@@ -41,10 +37,7 @@ def lattice(surface: Measured, limbus_mm: float) -> Lattice:
     """Sample a surface on a square that reaches beyond the limbus.
 
     Beyond the margin, or where the sheet becomes steep near its end, the surface is continued along its tangents,
-    because the path search may pass there.
-
-    Raises:
-        ValueError: the surface opens to +x.
+    because the path search may pass there. Raises ValueError if the surface opens to +x.
     """
     curvature, shape = (float(value) for value in surface.likeness())
     if curvature <= 0.0:

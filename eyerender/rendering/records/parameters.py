@@ -24,21 +24,16 @@ _Tree = TypeVar("_Tree")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceParameters:
-    """One refracting surface in the eye frame, lengths in mm.
+    """One refracting surface in the eye frame, lengths in mm."""
 
-    Attributes:
-        origin: (3,) origin of the surface's frame.
-        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a
-            row, 0) of a measured surface (see `surfaces`).
-        eta: refractive index in front of the surface over that behind it, for light that enters the eye.
-        axes: three unit axes (3,) of the surface's frame; None if they are those of the eye.
-        film: refractive index in front of the surface over that of a film on it; None if there can be no film.
-    """
-
-    origin: Vector
+    origin: Vector  # (3,) origin of the surface's frame
+    # (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a row, 0) of a
+    # measured surface (see `surfaces`)
     shape: tuple[Number, ...]
-    eta: Number
+    eta: Number  # refractive index in front of the surface over that behind it, for light that enters the eye
+    # three unit axes (3,) of the surface's frame; None if they are those of the eye
     axes: tuple[Vector, Vector, Vector] | None
+    # refractive index in front of the surface over that of a film on it; None if there can be no film
     film: Number | None = None
 
 
@@ -71,27 +66,16 @@ class IrisParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimbusParameters:
-    """The limbus and the cornea in front of it.
+    """The limbus and the cornea in front of it."""
 
-    Attributes:
-        radius: radius about the front surface's axis, mm.
-        floor: lowest x of the cornea in that surface's frame, mm.
-        gain: 1 / width, 1/mm.
-        albedo: albedo of the limbus.
-        up: (2,) upward direction in that surface's y, z plane.
-        lowering: 1 / aspect^2 - 1, with the height of the visible limbus over its width.
-        bulge: (3,) centre of a sphere that contains the front of the cornea.
-        bulge_radius: radius of that sphere, mm.
-    """
-
-    radius: Number
-    floor: Number
-    gain: Number
-    albedo: Number
-    up: tuple[Number, Number]
-    lowering: Number
-    bulge: Vector
-    bulge_radius: Number
+    radius: Number  # radius about the front surface's axis, mm
+    floor: Number  # lowest x of the cornea in that surface's frame, mm
+    gain: Number  # 1 / width, 1/mm
+    albedo: Number  # albedo of the limbus
+    up: tuple[Number, Number]  # (2,) upward direction in that surface's y, z plane
+    lowering: Number  # 1 / aspect^2 - 1, with the height of the visible limbus over its width
+    bulge: Vector  # (3,) centre of a sphere that contains the front of the cornea
+    bulge_radius: Number  # radius of that sphere, mm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,27 +117,17 @@ class CameraParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensParameters:
-    """A worn lens in the frame of its surfaces: the scene's for camera rays, the eye's for light of the lamps.
+    """A worn lens in the frame of its surfaces: the scene's for camera rays, the eye's for light of the lamps."""
 
-    Attributes:
-        front: the surface on the world's side.
-        back: the surface on the eye's side.
-        centre: (3,) centre of the outline.
-        axes: three unit axes (3,) of the lens; x points out of the face.
-        half: half axes of the outline along y and z, mm.
-        reach: distance from the frame's origin (mm) from which on rays are moved to the lens before they are traced.
-        gain: factor on Fresnel's transmittance of both surfaces.
-        edge: weight of rays that meet the edge: 0, or 1 at index 1, where nobody sees it.
-    """
-
-    front: SurfaceParameters
-    back: SurfaceParameters
-    centre: Vector
-    axes: tuple[Vector, Vector, Vector]
-    half: tuple[Number, Number]
+    front: SurfaceParameters  # the surface on the world's side
+    back: SurfaceParameters  # the surface on the eye's side
+    centre: Vector  # (3,) centre of the outline
+    axes: tuple[Vector, Vector, Vector]  # three unit axes (3,) of the lens; x points out of the face
+    half: tuple[Number, Number]  # half axes of the outline along y and z, mm
+    # distance from the frame's origin (mm) from which on rays are moved to the lens before they are traced
     reach: Number
-    gain: Number
-    edge: Number
+    gain: Number  # factor on Fresnel's transmittance of both surfaces
+    edge: Number  # weight of rays that meet the edge: 0, or 1 at index 1, where nobody sees it
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,50 +140,29 @@ class ImageParameters:
 
 @dataclass(kw_only=True)
 class FrameParameters:
-    """Parameters that host and device share; lengths in mm, in the eye frame or the scene's frame.
+    """Parameters that host and device share; lengths in mm, in the eye frame or the scene's frame."""
 
-    Attributes:
-        inner_index: refractive index of the medium in front of the iris.
-        stop: the aperture stop.
-        iris: the iris.
-        limbus: the limbus.
-        sclera: the sclera.
-        image: the stop's Gaussian image.
-        pose: the pose of the eye.
-        camera: the camera.
-        pupil_albedo: share of the light that the pupil reflects.
-        globe_reach: radius (mm) of the sphere about the sclera's centre that contains the cornea too.
-        backdrop_x: the background's plane, x in the scene's frame (mm).
-        ambient_irradiance: irradiance of uniform light from all sides, mW/mm^2.
-    """
-
-    inner_index: Number
-    stop: StopParameters
+    inner_index: Number  # refractive index of the medium in front of the iris
+    stop: StopParameters  # the aperture stop
     iris: IrisParameters
     limbus: LimbusParameters
     sclera: ScleraParameters
-    image: ImageParameters
-    pose: PoseParameters
+    image: ImageParameters  # the stop's Gaussian image
+    pose: PoseParameters  # the pose of the eye
     camera: CameraParameters
-    pupil_albedo: Number
-    globe_reach: Number
-    backdrop_x: Number
-    ambient_irradiance: Number
+    pupil_albedo: Number  # share of the light that the pupil reflects
+    globe_reach: Number  # radius (mm) of the sphere about the sclera's centre that contains the cornea too
+    backdrop_x: Number  # the background's plane, x in the scene's frame (mm)
+    ambient_irradiance: Number  # irradiance of uniform light from all sides, mW/mm^2
 
 
 @dataclass(kw_only=True)
 class Parameters(FrameParameters):
-    """All parameters of a frame on the host.
+    """All parameters of a frame on the host."""
 
-    Attributes:
-        surfaces: the refracting surfaces in front of the iris, from outside inwards.
-        lenses: worn lenses in the scene's frame, from outside inwards.
-        turned_lenses: the same in the eye's frame.
-    """
-
-    surfaces: tuple[SurfaceParameters, ...]
-    lenses: tuple[LensParameters, ...] = ()
-    turned_lenses: tuple[LensParameters, ...] = ()
+    surfaces: tuple[SurfaceParameters, ...]  # the refracting surfaces in front of the iris, from outside inwards
+    lenses: tuple[LensParameters, ...] = ()  # worn lenses in the scene's frame, from outside inwards
+    turned_lenses: tuple[LensParameters, ...] = ()  # the same in the eye's frame
 
 
 def packed(tree: Any) -> np.ndarray[Any, np.dtype[np.float32]]:

@@ -64,26 +64,18 @@ class NormalForm(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DeviceSurface:
-    """One refracting surface; every number is a Dr.Jit array of size one.
+    """One refracting surface; every number is a Dr.Jit array of size one."""
 
-    Attributes:
-        origin: origin of the surface's frame.
-        axes: unit axes of the surface's frame in the eye frame; None if they are those of the eye.
-        shape: (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a
-            row, 0) of a measured surface, whose conic of R and p is where the search for hits starts.
-        eta: refractive index in front over that behind, for light that enters the eye.
-        kind: quadric, biconic or measured.
-        table: the cells of a measured surface (see `lattice`).
-        film: refractive index in front over that of a film on the surface; None without a film.
-    """
-
-    origin: mi.Vector3f
+    origin: mi.Vector3f  # origin of the surface's frame
+    # unit axes of the surface's frame in the eye frame; None if they are those of the eye
     axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f] | None
+    # (a.x, a.y, a.z, b, c) of a quadric, (Ry, Rz, py, pz, 0) of a biconic, (R, p, cells per mm, cells in a row, 0) of a
+    # measured surface, whose conic of R and p is where the search for hits starts
     shape: tuple[mi.Float, ...]
-    eta: mi.Float
-    kind: Kind
-    table: mi.Float | None = None
-    film: mi.Float | None = None
+    eta: mi.Float  # refractive index in front over that behind, for light that enters the eye
+    kind: Kind  # quadric, biconic or measured
+    table: mi.Float | None = None  # the cells of a measured surface (see `lattice`)
+    film: mi.Float | None = None  # refractive index in front over that of a film on the surface; None without a film
 
     def mirrored(self, bend: Bend) -> mi.Float:
         """Compute the reflectance for a ray that the surface refracts."""

@@ -44,16 +44,11 @@ class BackgroundGeometry:
 
     Kernels read them from buffers instead of calling methods of Mitsuba's shapes and materials, because the code of
     such a call depends on the number of objects that the process has created.
-
-    Attributes:
-        corners: four entries for each triangle, of which the first three are its vertices.
-        vertices: four numbers per vertex: position (mm), and albedo, or a negative number to use the map.
-        map: albedo of the plane.
     """
 
-    corners: mi.UInt32
-    vertices: mi.Float
-    map: Any
+    corners: mi.UInt32  # four entries for each triangle, of which the first three are its vertices
+    vertices: mi.Float  # four numbers per vertex: position (mm), and albedo, or a negative number to use the map
+    map: Any  # albedo of the plane
 
     @classmethod
     def of(cls, faces: Ints) -> BackgroundGeometry:

@@ -18,19 +18,12 @@ _BESIDE = 0.25  # share of a window's size: objects in this border may blur into
 
 @dataclass(frozen=True, slots=True)
 class Blur:
-    """Defocus of a job's image.
-
-    Attributes:
-        job: the job.
-        subject_px: diameter of the circle of confusion of the eye.
-        layered: whether the blur of other depths differs visibly.
-        reach: number of pixels needed beyond the window's border.
-    """
+    """Defocus of a job's image."""
 
     job: RenderJob
-    subject_px: float
-    layered: bool
-    reach: int
+    subject_px: float  # diameter of the circle of confusion of the eye
+    layered: bool  # whether the blur of other depths differs visibly
+    reach: int  # number of pixels needed beyond the window's border
 
     @classmethod
     def of(cls, job: RenderJob, posed: RegionMesh | None) -> Blur:

@@ -48,21 +48,14 @@ class DiffusionGrids:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetCells:
-    """Cells of the grid over a posed sheet of skin.
+    """Cells of the grid over a posed sheet of skin."""
 
-    Attributes:
-        rows: number of the grid's rows.
-        columns: number of its columns, which form a closed ring.
-        numbers: numbers of the cells that matter, and of the surrounding cells on the grid reduced by 2 and by 4.
-        edges: row of the sheet's vertices at the edges of the grid's rows.
-        middles: row of the sheet's vertices in their middles.
-    """
-
-    rows: int
-    columns: int
+    rows: int  # number of the grid's rows
+    columns: int  # number of its columns, which form a closed ring
+    # numbers of the cells that matter, and of the surrounding cells on the grid reduced by 2 and by 4
     numbers: tuple[Ints, ...]
-    edges: Singles
-    middles: Singles
+    edges: Singles  # row of the sheet's vertices at the edges of the grid's rows
+    middles: Singles  # row of the sheet's vertices in their middles
 
     @classmethod
     def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetCells:

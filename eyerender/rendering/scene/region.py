@@ -235,60 +235,39 @@ class SkinPoint:
 
 @dataclass(kw_only=True)
 class SkinGeometry:
-    """A posed region for the kernels: the corners of its triangles, and the map.
+    """A posed region for the kernels: the corners of its triangles, and the map."""
 
-    Attributes:
-        map: relative albedo, slopes and gloss over the coordinates of the map.
-        water: the menisci, which are not in the scene because light passes through them; None if they are opaque.
-        is_sheet: whether the skin is known to be one surface.
-        faces: four entries per triangle: its vertices, and 0 if it lies inside the sheet of skin, away from its ends,
-            else 1.
-        vertices: eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second
-            coordinate of the map.
-        received: four numbers per vertex: light from other surfaces, as in `radiosityfield.RadiosityField`.
-        sheet: number of triangles of the sheet, which come first.
-        hairs_end: number of the first triangle behind the hairs, which follow the sheet.
-        film: number of the first triangle of the menisci.
-        mirror: -1 for a left eye, else 1.
-        thin: coordinate v of the map at which the conjunctiva has its full thickness; 0 without a map.
-        spectacles: numbers of the first triangle of the frame of spectacles, and of the first one behind; None without.
-        obstacles: the same for obstacles, which follow.
-    """
-
-    map: Any
+    map: Any  # relative albedo, slopes and gloss over the coordinates of the map
+    # the menisci, which are not in the scene because light passes through them; None if they are opaque
     water: mi.Scene | None
-    is_sheet: bool
+    is_sheet: bool  # whether the skin is known to be one surface
+    # four entries per triangle: its vertices, and 0 if it lies inside the sheet of skin, away from its ends, else 1
     faces: mi.UInt32
+    # eight numbers for each vertex: place (scene's frame, mm), first coordinate of the map, normal, second coordinate
+    # of the map
     vertices: mi.Float
-    received: mi.Float
-    sheet: mi.UInt32
-    hairs_end: mi.UInt32
-    film: mi.UInt32
-    mirror: mi.Float
-    thin: mi.Float
+    received: mi.Float  # four numbers per vertex: light from other surfaces, as in `radiosityfield.RadiosityField`
+    sheet: mi.UInt32  # number of triangles of the sheet, which come first
+    hairs_end: mi.UInt32  # number of the first triangle behind the hairs, which follow the sheet
+    film: mi.UInt32  # number of the first triangle of the menisci
+    mirror: mi.Float  # -1 for a left eye, else 1
+    thin: mi.Float  # coordinate v of the map at which the conjunctiva has its full thickness; 0 without a map
+    # numbers of the first triangle of the frame of spectacles, and of the first one behind; None without
     spectacles: tuple[mi.UInt32, mi.UInt32] | None = None
-    obstacles: tuple[mi.UInt32, mi.UInt32] | None = None
+    obstacles: tuple[mi.UInt32, mi.UInt32] | None = None  # the same for obstacles, which follow
 
     @classmethod
     def of(
         cls,
-        look: mi.Texture2f,
-        layout: RegionLayout,
-        mirror: float,
-        thin: float,
+        look: mi.Texture2f,  # the map
+        layout: RegionLayout,  # the triangles
+        mirror: float,  # -1 for a left eye, else 1
+        thin: float,  # as the attribute
+        # which triangles of the sheet are away from its ends; None if it may not be a single surface
         inner: Bools | None,
-        water: mi.Scene | None,
+        water: mi.Scene | None,  # the menisci
     ) -> SkinGeometry:
-        """Copy the triangles of a region to the device.
-
-        Args:
-            look: the map.
-            layout: the triangles.
-            mirror: -1 for a left eye, else 1.
-            thin: as the attribute.
-            inner: which triangles of the sheet are away from its ends; None if it may not be a single surface.
-            water: the menisci.
-        """
+        """Copy the triangles of a region to the device."""
         faces = np.ones((len(layout.faces), 4), np.uint32)  # four entries, which are gathered together
         faces[:, :3] = layout.faces
         faces[: layout.face_ends[0], 3] = False if inner is None else ~inner

@@ -53,23 +53,15 @@ class Chamber:
     """The anterior chamber of one eye, in the eye frame; compared by identity.
 
     Arrays with PATCHES rows list the rings from the middle, then the wall.
-
-    Attributes:
-        root_mm: radius of the iris' root, between two rings.
-        reach_mm: radius of the edge of the last ring.
-        points: (PATCHES, 3) patches, mm.
-        normals: (PATCHES, 3) unit normals into the chamber.
-        valid: (PATCHES,) whether a patch is in the chamber.
-        exchange: (PATCHES, PATCHES) form factors: irradiance of each patch per radiosity of each other.
-        leaving: (PATCHES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none.
     """
 
-    root_mm: float
-    reach_mm: float
-    points: Floats
-    normals: Floats
-    valid: Bools
-    exchange: Floats
+    root_mm: float  # radius of the iris' root, between two rings
+    reach_mm: float  # radius of the edge of the last ring
+    points: Floats  # (PATCHES, 3) patches, mm
+    normals: Floats  # (PATCHES, 3) unit normals into the chamber
+    valid: Bools  # (PATCHES,) whether a patch is in the chamber
+    exchange: Floats  # (PATCHES, PATCHES) form factors: irradiance of each patch per radiosity of each other
+    # (PATCHES, RAYS, 7) origin and direction of the rays that leave the eye, and n^2 (1 - F), 0 for none
     leaving: Floats
 
 
@@ -97,11 +89,8 @@ def chamber_of(eye: EyeModel, film: float) -> Chamber:
 def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float, aspect: float = 1.0) -> Floats:
     """Compute the share (PATCHES, TURNS) of the light through each limbal sector that reaches each patch.
 
-    Args:
-        eye: the eye.
-        chamber: its chamber.
-        width_mm: width of the cornea's opaque rim.
-        aspect: height of the visible limbus over its width.
+    `chamber`: its chamber; `width_mm`: width of the cornea's opaque rim; `aspect`: height of the visible limbus over
+    its width.
     """
     return _through_limbus(chamber, eye.front[0], float(eye.limbus_radius_mm), float(width_mm), float(aspect))
 
@@ -110,15 +99,10 @@ def through_limbus(eye: EyeModel, chamber: Chamber, width_mm: float, aspect: flo
 def bundles(chamber: Chamber, halvings: int) -> tuple[Floats, Any]:
     """Bundle the rays of all patches that leave an eye by similar origin and direction.
 
-    One ray of each bundle is traced for all. No ray is left out, because few leave from the outer iris.
-
-    Args:
-        chamber: the chamber of the eye.
-        halvings: how often the rays are halved into bundles.
-
-    Returns:
-        Origin and direction (bundles, 6) of a ray from the middle of each bundle, and the gain (PATCHES, bundles),
-        sparse, by which pi times the radiance along it becomes irradiance of each patch.
+    One ray of each bundle is traced for all. No ray is left out, because few leave from the outer iris. `chamber`: the
+    chamber of the eye; `halvings`: how often the rays are halved into bundles. Returns origin and direction (bundles,
+    6) of a ray from the middle of each bundle, and the gain (PATCHES, bundles), sparse, by which pi times the radiance
+    along it becomes irradiance of each patch.
     """
     patch, ray = np.nonzero(chamber.leaving[..., 6])
     rays, count = chamber.leaving[patch, ray], 2**halvings

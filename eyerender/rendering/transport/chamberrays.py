@@ -30,28 +30,17 @@ class Walls:
 
     The wall is a cone about x with the radius of the limbus at x = `top`, which grows by `slope` per mm downwards. If
     the cornea has a back surface, which meets the plane of the iris, the wall is the cornea's rim in front of it.
-
-    Attributes:
-        front: refracting surfaces from outside inwards.
-        indices: refractive index behind each.
-        film: refractive index of the film on the first surface.
-        centre: centre of the plane of the iris, mm.
-        normal: normal of that plane.
-        limbus: radius of the limbus about the axis, mm.
-        root: radius of the root of the iris, mm.
-        sclera_x: x of the centre of the sclera's sphere, mm.
-        sclera_radius: its radius, mm.
     """
 
-    front: tuple[Surface, ...]
-    indices: tuple[float, ...]
-    film: float
-    centre: tuple[float, ...]
-    normal: tuple[float, ...]
-    limbus: float
-    root: float
-    sclera_x: float
-    sclera_radius: float
+    front: tuple[Surface, ...]  # refracting surfaces from outside inwards
+    indices: tuple[float, ...]  # refractive index behind each
+    film: float  # refractive index of the film on the first surface
+    centre: tuple[float, ...]  # centre of the plane of the iris, mm
+    normal: tuple[float, ...]  # normal of that plane
+    limbus: float  # radius of the limbus about the axis, mm
+    root: float  # radius of the root of the iris, mm
+    sclera_x: float  # x of the centre of the sclera's sphere, mm
+    sclera_radius: float  # its radius, mm
 
     @cached_property
     def top(self) -> float:

@@ -46,23 +46,14 @@ _SMALL, _WIDE_RAYS = 0.02, 16  # radius over distance of lamps of which one poin
 
 @dataclass(kw_only=True)
 class DiffusedLight:
-    """Light of the lamps on skin and globe after subsurface scattering.
+    """Light of the lamps on skin and globe after subsurface scattering."""
 
-    Attributes:
-        size: size of the grid over the skin.
-        skin: light of cells of the skin.
-        skin_seen: shares of the lamps that its coarse cells see, cell by cell.
-        globe: light of cells of the globe.
-        globe_seen: shares of the lamps that cells of the globe see.
-        lamps: number of the lamps, at least 1.
-    """
-
-    size: SheetSize
-    skin: mi.Float
-    skin_seen: mi.Float
-    globe: mi.Float
-    globe_seen: mi.Float
-    lamps: mi.UInt32
+    size: SheetSize  # size of the grid over the skin
+    skin: mi.Float  # light of cells of the skin
+    skin_seen: mi.Float  # shares of the lamps that its coarse cells see, cell by cell
+    globe: mi.Float  # light of cells of the globe
+    globe_seen: mi.Float  # shares of the lamps that cells of the globe see
+    lamps: mi.UInt32  # number of the lamps, at least 1
 
     @classmethod
     def build(

@@ -62,14 +62,9 @@ def direct_light(
 ) -> tuple[mi.Float, mi.Float]:
     """Compute the unshadowed light of a lamp at matte points in air.
 
-    Args:
-        lamp: the lamp.
-        source: points of the lamp.
-        view: the lit points.
-        mirror: normal of the mirroring surface and unit direction of the viewer (eye frame), to compute their sheen.
-
-    Returns:
-        Irradiance (mW/mm^2), and the radiance of the sheen towards the viewer.
+    `source`: points of the lamp; `view`: the lit points; `mirror`: normal of the mirroring surface and unit direction
+    of the viewer (eye frame), to compute their sheen. Returns irradiance (mW/mm^2), and the radiance of the sheen
+    towards the viewer.
     """
     to = source - view.point
     inv2 = dr.rcp(dr.squared_norm(to))
@@ -92,24 +87,15 @@ def irradiance(lamp: DeviceLamp, source: mi.Vector3f, x: mi.Vector3f, normal: mi
 @syntax
 def irradiance_at(
     frame: DeviceFrame,
-    x: mi.Vector3f,
-    normal: mi.Vector3f,
-    u: mi.Float,
-    v: mi.Float,
+    x: mi.Vector3f,  # the points (eye frame)
+    normal: mi.Vector3f,  # unit normals there
+    u: mi.Float,  # first coordinate on each lamp's disc, [0, 1)
+    v: mi.Float,  # second coordinate
     *,
-    off_globe: mi.Bool,
-    on_sheet: mi.Bool,
+    off_globe: mi.Bool,  # marks points off the globe
+    on_sheet: mi.Bool,  # marks points on the outer side of a region's sheet of skin, where shadow maps save rays
 ) -> tuple[mi.Float, mi.Float]:
     """Compute the direct irradiance of points in air from all lamps.
-
-    Args:
-        frame: the frame.
-        x: the points (eye frame).
-        normal: unit normals there.
-        u: first coordinate on each lamp's disc, [0, 1).
-        v: second coordinate.
-        off_globe: marks points off the globe.
-        on_sheet: marks points on the outer side of a region's sheet of skin, where shadow maps save rays.
 
     Returns:
         Irradiance (mW/mm^2), with and without shadows.
@@ -159,24 +145,14 @@ def onto_matte(frame: DeviceFrame, view: SurfaceInteraction, u: mi.Float, v: mi.
 @syntax
 def irradiance_through_cornea(
     frame: DeviceFrame,
-    inner: mi.Vector3f,
-    inside: mi.Bool,
-    u: mi.Float,
-    v: mi.Float,
-    normal: mi.Vector3f | None = None,
-    surfaces: tuple[DeviceSurface, ...] | None = None,
+    inner: mi.Vector3f,  # the points (eye frame)
+    inside: mi.Bool,  # points for which to compute it
+    u: mi.Float,  # first coordinate on each lamp's disc, [0, 1)
+    v: mi.Float,  # second coordinate
+    normal: mi.Vector3f | None = None,  # unit normals at the points; None for points of the plane of the iris
+    surfaces: tuple[DeviceSurface, ...] | None = None,  # surfaces in front of the points; None for all
 ) -> tuple[mi.Float, mi.UInt32]:
-    """Compute the irradiance (mW/mm^2) of all lamps at points behind the cornea, and count failed paths.
-
-    Args:
-        frame: the frame.
-        inner: the points (eye frame).
-        inside: points for which to compute it.
-        u: first coordinate on each lamp's disc, [0, 1).
-        v: second coordinate.
-        normal: unit normals at the points; None for points of the plane of the iris.
-        surfaces: surfaces in front of the points; None for all.
-    """
+    """Compute the irradiance (mW/mm^2) of all lamps at points behind the cornea, and count failed paths."""
     wanted = inside & behind((surfaces or frame.surfaces)[-1], inner)
     cached, count = frame.caches.iris, frame.lights.count
     many = count > BITS
@@ -253,23 +229,14 @@ def on_relief(frame: DeviceFrame, view: SurfaceInteraction) -> SurfaceInteractio
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LampPath:
-    """Light path from a point of a lamp through the cornea to a point behind it.
+    """Light path from a point of a lamp through the cornea to a point behind it."""
 
-    Attributes:
-        gain: irradiance (mW/mm^2) if nothing blocks the path.
-        whole: the same if the whole cornea were clear.
-        entry: where the path enters the front surface (eye frame).
-        enters: whether there is a path, through the clear part of the cornea.
-        blocked: whether anything blocks the path.
-        failed: whether the search did not converge.
-    """
-
-    gain: mi.Float
-    whole: mi.Float
-    entry: mi.Vector3f
-    enters: mi.Bool
-    blocked: mi.Bool
-    failed: mi.Bool
+    gain: mi.Float  # irradiance (mW/mm^2) if nothing blocks the path
+    whole: mi.Float  # the same if the whole cornea were clear
+    entry: mi.Vector3f  # where the path enters the front surface (eye frame)
+    enters: mi.Bool  # whether there is a path, through the clear part of the cornea
+    blocked: mi.Bool  # whether anything blocks the path
+    failed: mi.Bool  # whether the search did not converge
 
     @classmethod
     def find(
@@ -319,10 +286,8 @@ def _through_lenses(
     """Solve for paths through worn lenses, also beyond their outlines, and the eye, for lamps that light it so.
 
     `ends` are points of the lamp, the target, and the surfaces of the eye in front of it; `beside` paths past the
-    lenses for the other lamps, None if there are none. `ahead_mm` is as for `connect`.
-
-    Returns:
-        The paths, with their entries into the cornea, and the points in whose direction light arrives there.
+    lenses for the other lamps, None if there are none. `ahead_mm` is as for `connect`. Returns the paths, with their
+    entries into the cornea, and the points in whose direction light arrives there.
     """
     source, target, chain = ends
     lenses = tuple(surface for lens in frame.turned_lenses for surface in (lens.front, lens.back))

@@ -48,15 +48,10 @@ class Rectangle:
 
 @dataclass(kw_only=True)
 class Panels:
-    """The rectangles of a frame, in one buffer, so kernels do not depend on their number.
+    """The rectangles of a frame, in one buffer, so kernels do not depend on their number."""
 
-    Attributes:
-        count: number of rectangles.
-        rows: 13 numbers per rectangle, as in `job.panel_table`.
-    """
-
-    count: mi.UInt32
-    rows: mi.Float
+    count: mi.UInt32  # number of rectangles
+    rows: mi.Float  # 13 numbers per rectangle, as in `job.panel_table`
 
     @classmethod
     def upload(cls, table: Floats) -> Panels:
@@ -157,27 +152,16 @@ def _texture(values: NDArray[np.float32]) -> Any:
 
 @dataclass(kw_only=True)
 class Ambience:
-    """Uniform light, panels and surroundings for the integrator; kernels do not depend on their number.
-
-    Attributes:
-        panels: the panels.
-        texture: radiance of the map.
-        table: irradiance of its soft part and of the rest, by normal.
-        even: irradiance of uniform light, mW/mm^2.
-        scale: radiance (mW/mm^2/sr) per value of the map.
-        rows: number of rows of the map.
-        ceiling: largest value of its soft part.
-        axes: axes of the map's frame in the scene's frame.
-    """
+    """Uniform light, panels and surroundings for the integrator; kernels do not depend on their number."""
 
     panels: Panels
-    texture: Any
-    table: Any
-    even: mi.Float
-    scale: mi.Float
-    rows: mi.Float
-    ceiling: mi.Float
-    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
+    texture: Any  # radiance of the map
+    table: Any  # irradiance of its soft part and of the rest, by normal
+    even: mi.Float  # irradiance of uniform light, mW/mm^2
+    scale: mi.Float  # radiance (mW/mm^2/sr) per value of the map
+    rows: mi.Float  # number of rows of the map
+    ceiling: mi.Float  # largest value of its soft part
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]  # axes of the map's frame in the scene's frame
 
     @classmethod
     def build(cls, even_mw_mm2: float, panels: Floats, spec: RadianceMap | None, maps: Maps) -> Ambience:
@@ -234,10 +218,7 @@ class Ambience:
 def bright_lamps(spec: RadianceMap | None, maps: Maps, anchor_mm: Floats) -> tuple[Lamp, ...]:
     """Return the light of a map above its soft part, as distant lamps.
 
-    Args:
-        spec: the map.
-        maps: cache of maps.
-        anchor_mm: origin of the scene's frame in the world.
+    `spec`: the map; `maps`: cache of maps; `anchor_mm`: origin of the scene's frame in the world.
     """
     if spec is None:
         return ()

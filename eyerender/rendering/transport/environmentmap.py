@@ -53,20 +53,14 @@ _SIDES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EnvironmentMap(ArrayValue):
-    """A prepared environment map, in its own frame.
+    """A prepared environment map, in its own frame."""
 
-    Attributes:
-        values: (h, 2 h) radiance, float32.
-        ceiling: largest radiance of the soft part.
-        irradiance: (rows, 2 rows, 2) irradiance of surfaces whose normal is the direction of a texel, from the soft
-            part and from the rest, float32.
-        bright: (n, 3) directions that represent the rest, times the irradiance of a surface that faces them.
-    """
-
-    values: Any
-    ceiling: float
+    values: Any  # (h, 2 h) radiance, float32
+    ceiling: float  # largest radiance of the soft part
+    # (rows, 2 rows, 2) irradiance of surfaces whose normal is the direction of a texel, from the soft part and from the
+    # rest, float32
     irradiance: Any
-    bright: Floats
+    bright: Floats  # (n, 3) directions that represent the rest, times the irradiance of a surface that faces them
 
 
 def read_map(path: str | Path, channel: str = "red") -> Floats:

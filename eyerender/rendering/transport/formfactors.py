@@ -32,54 +32,31 @@ _TOUCHING_MM, _UNDER_MM = 0.3, 4.0
 
 @dataclass(kw_only=True)
 class RayHits:
-    """Hits of the patches' rays, on the device, one number per ray.
+    """Hits of the patches' rays, on the device, one number per ray."""
 
-    Attributes:
-        target: the patch that is hit.
-        weight: share of its irradiance that is sent back.
-        near: whether the hit is very close.
-        open: whether nothing is hit.
-        sky: irradiance from uniform light and the soft part of a map, where nothing is hit.
-        free: the same, as if nothing were hit.
-        on_skin: whether the outer side of the sheet of skin is hit.
-        point: the hit (eye frame).
-        normal: unit normal there.
-    """
-
-    target: mi.UInt32
-    weight: mi.Float
-    near: mi.Float
-    open: mi.Bool
-    sky: mi.Float
-    free: mi.Float
-    on_skin: mi.Bool
-    point: mi.Vector3f
-    normal: mi.Vector3f
+    target: mi.UInt32  # the patch that is hit
+    weight: mi.Float  # share of its irradiance that is sent back
+    near: mi.Float  # whether the hit is very close
+    open: mi.Bool  # whether nothing is hit
+    sky: mi.Float  # irradiance from uniform light and the soft part of a map, where nothing is hit
+    free: mi.Float  # the same, as if nothing were hit
+    on_skin: mi.Bool  # whether the outer side of the sheet of skin is hit
+    point: mi.Vector3f  # the hit (eye frame)
+    normal: mi.Vector3f  # unit normal there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchRays:
-    """Rays of all patches on the host, one number per ray.
+    """Rays of all patches on the host, one number per ray."""
 
-    Attributes:
-        shares: (patches, rays) share of each ray in the mean over a patch's rays, sparse.
-        target: as in `RayHits`.
-        weight: as in `RayHits`.
-        near: as in `RayHits`.
-        sky: as in `RayHits`.
-        free: as in `RayHits`.
-        lit: direct irradiance from the lamps at the point of the skin that is hit, -1 where unknown.
-        bare: the same without shadows, -1 where no skin is hit.
-    """
-
-    shares: csr_array
-    target: Ints
-    weight: Reals
-    near: Reals
-    sky: Reals
-    free: Reals
-    lit: Reals
-    bare: Reals
+    shares: csr_array  # (patches, rays) share of each ray in the mean over a patch's rays, sparse
+    target: Ints  # as in `RayHits`
+    weight: Reals  # as in `RayHits`
+    near: Reals  # as in `RayHits`
+    sky: Reals  # as in `RayHits`
+    free: Reals  # as in `RayHits`
+    lit: Reals  # direct irradiance from the lamps at the point of the skin that is hit, -1 where unknown
+    bare: Reals  # the same without shadows, -1 where no skin is hit
 
     @classmethod
     def read(cls, patches: FramePatches, hits: RayHits, lit: mi.Float | None, bare: mi.Float | None) -> PatchRays:

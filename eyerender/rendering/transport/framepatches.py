@@ -50,23 +50,14 @@ _CLOSE_MM = 10.5  # distance from the cornea's centre to skin onto which it mirr
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChamberPatches:
-    """The chamber of an eye, and everything about it that does not depend on the pose.
-
-    Attributes:
-        chamber: the chamber.
-        form_factors: irradiance of its patches per irradiance of each other.
-        limbus: irradiance of its patches per irradiance of the limbus' sectors.
-        rows: on the device, the patches, their normals, and whether they are in the eye.
-        leaving: on the device, a ray for each bundle of those that leave the eye.
-        gain: (patches, bundles) gain with which each bundle lights each patch, sparse.
-    """
+    """The chamber of an eye, and everything about it that does not depend on the pose."""
 
     chamber: Chamber
-    form_factors: Floats
-    limbus: Floats
-    rows: mi.Float
-    leaving: mi.Float
-    gain: Any
+    form_factors: Floats  # irradiance of its patches per irradiance of each other
+    limbus: Floats  # irradiance of its patches per irradiance of the limbus' sectors
+    rows: mi.Float  # on the device, the patches, their normals, and whether they are in the eye
+    leaving: mi.Float  # on the device, a ray for each bundle of those that leave the eye
+    gain: Any  # (patches, bundles) gain with which each bundle lights each patch, sparse
 
     @classmethod
     def of(cls, eye: EyeModel, film_index: float, look: Look, halvings: int) -> ChamberPatches:
@@ -89,24 +80,16 @@ def round_up(number: int, step: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RayPlan:
-    """Patches on the skin of a subject, and the rays of all patches outside the eye; independent of the pose.
+    """Patches on the skin of a subject, and the rays of all patches outside the eye; independent of the pose."""
 
-    Attributes:
-        skin: the patches, None for a bare eye.
-        count: (patches,) number of rays of each patch outside the chamber.
-        of_patch: on the device, the patch of each ray, padded.
-        stands_for: on the device, the patches that represent both sides of each vertex.
-        near: on the device, the patches around every vertex: first those of rank one for all vertices, then those of
-            rank two, ...
-        weight: on the device, their weights there.
-    """
-
-    skin: SkinPatches | None
-    count: Ints
-    of_patch: mi.UInt32
-    stands_for: mi.Int32
+    skin: SkinPatches | None  # the patches, None for a bare eye
+    count: Ints  # (patches,) number of rays of each patch outside the chamber
+    of_patch: mi.UInt32  # on the device, the patch of each ray, padded
+    stands_for: mi.Int32  # on the device, the patches that represent both sides of each vertex
+    # on the device, the patches around every vertex: first those of rank one for all vertices, then those of rank two,
+    # ..
     near: mi.UInt32
-    weight: mi.Float
+    weight: mi.Float  # on the device, their weights there
 
     @classmethod
     def of(cls, on_globe: int, others: int, skin: SkinPatches | None) -> RayPlan:
@@ -162,25 +145,15 @@ def _at_vertices(
 
 @dataclass(frozen=True, kw_only=True)
 class FramePatches:
-    """The patches of a frame, on the host.
-
-    Attributes:
-        job: the job.
-        globe: patches of the globe.
-        interior: patches of the chamber.
-        plan: the rays.
-        points: (n, 3) patches on skin and lids, or on the background.
-        normals: (n, 3) unit normals there.
-        plane: as in `RadiosityField`.
-    """
+    """The patches of a frame, on the host."""
 
     job: RenderJob
-    globe: GlobePatches
-    interior: ChamberPatches
-    plan: RayPlan
-    points: Floats
-    normals: Floats
-    plane: tuple[float, float, float]
+    globe: GlobePatches  # patches of the globe
+    interior: ChamberPatches  # patches of the chamber
+    plan: RayPlan  # the rays
+    points: Floats  # (n, 3) patches on skin and lids, or on the background
+    normals: Floats  # (n, 3) unit normals there
+    plane: tuple[float, float, float]  # as in `RadiosityField`
 
     @property
     def on_globe(self) -> int:
@@ -280,41 +253,23 @@ def gather_rows(buffer: mi.Float, width: int, i: mi.UInt32, active: mi.Bool | bo
 
 @dataclass(kw_only=True)
 class PatchTables:
-    """The patches of a frame on the device.
+    """The patches of a frame on the device."""
 
-    Attributes:
-        outer: points and normals of patches outside the eye (scene's frame).
-        inside: points and normals of patches of the chamber, as in `Interior`.
-        near_cornea: patches on skin onto which the cornea mirrors lamps, padded; None for none.
-        leaving: rays that leave the eye.
-        of_patch: the patch of each ray outside the eye.
-        stands_for: the patches that represent both sides of each vertex.
-        on_globe: number of patches on the globe.
-        on_skin: number of patches on skin.
-        before_limbus: number of patches outside the eye that are not on the limbus.
-        outside: number of patches outside the eye.
-        rays_outside: number of their rays.
-        rays: number of all rays.
-        outer_spots: first numbers of the points on the lamps' discs, for patches outside the eye.
-        mirrored_spots: the same for patches near the cornea.
-        inside_spots: the same for patches of the chamber.
-    """
-
-    outer: mi.Float
-    inside: mi.Float
-    near_cornea: mi.Float | None
-    leaving: mi.Float
-    of_patch: mi.UInt32
-    stands_for: mi.Int32
-    on_globe: mi.UInt32
-    on_skin: mi.UInt32
-    before_limbus: mi.UInt32
-    outside: mi.UInt32
-    rays_outside: mi.UInt32
-    rays: mi.UInt32
-    outer_spots: tuple[mi.UInt32, ...]
-    mirrored_spots: tuple[mi.UInt32, ...]
-    inside_spots: tuple[mi.UInt32, ...]
+    outer: mi.Float  # points and normals of patches outside the eye (scene's frame)
+    inside: mi.Float  # points and normals of patches of the chamber, as in `Interior`
+    near_cornea: mi.Float | None  # patches on skin onto which the cornea mirrors lamps, padded; None for none
+    leaving: mi.Float  # rays that leave the eye
+    of_patch: mi.UInt32  # the patch of each ray outside the eye
+    stands_for: mi.Int32  # the patches that represent both sides of each vertex
+    on_globe: mi.UInt32  # number of patches on the globe
+    on_skin: mi.UInt32  # number of patches on skin
+    before_limbus: mi.UInt32  # number of patches outside the eye that are not on the limbus
+    outside: mi.UInt32  # number of patches outside the eye
+    rays_outside: mi.UInt32  # number of their rays
+    rays: mi.UInt32  # number of all rays
+    outer_spots: tuple[mi.UInt32, ...]  # first numbers of the points on the lamps' discs, for patches outside the eye
+    mirrored_spots: tuple[mi.UInt32, ...]  # the same for patches near the cornea
+    inside_spots: tuple[mi.UInt32, ...]  # the same for patches of the chamber
 
     @classmethod
     def upload(cls, patches: FramePatches, lamps: LampTable, lanes: Lanes) -> PatchTables:
@@ -342,23 +297,14 @@ class PatchTables:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lanes:
-    """Numbers of lanes of a frame's kernels, rounded up so that recordings serve many frames.
+    """Numbers of lanes of a frame's kernels, rounded up so that recordings serve many frames."""
 
-    Attributes:
-        outside: lanes for patches outside the eye.
-        near_cornea: lanes for patches onto which the cornea mirrors lamps.
-        rays: lanes for rays.
-        at_hits: lanes for rays that compute the light at the point of the skin that they hit.
-        lamps: whether there are lamps.
-        panels: whether there are parts of panels or bright parts of a map.
-    """
-
-    outside: int
-    near_cornea: int
-    rays: int
-    at_hits: int
-    lamps: bool
-    panels: bool
+    outside: int  # lanes for patches outside the eye
+    near_cornea: int  # lanes for patches onto which the cornea mirrors lamps
+    rays: int  # lanes for rays
+    at_hits: int  # lanes for rays that compute the light at the point of the skin that they hit
+    lamps: bool  # whether there are lamps
+    panels: bool  # whether there are parts of panels or bright parts of a map
 
     @classmethod
     def of(cls, patches: FramePatches, lamps: LampTable, panels: LampTable) -> Lanes:

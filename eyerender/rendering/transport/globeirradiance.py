@@ -29,28 +29,19 @@ _LOW, _SLOPE = 0.1, 0.6  # cosines: of a lamp about to set, and of one hidden by
 
 @dataclass(kw_only=True)
 class GlobeIrradiance:
-    """Irradiance of matte surfaces of a bare eye from lamps, and of the globe from other surfaces.
+    """Irradiance of matte surfaces of a bare eye from lamps, and of the globe from other surfaces."""
 
-    Attributes:
-        globe: grid over the globe's front.
-        plane: grid over the plane around it.
-        reach: half the width of the plane's grid, mm.
-    """
-
-    globe: IrradianceGrid
-    plane: IrradianceGrid
-    reach: mi.Float
+    globe: IrradianceGrid  # grid over the globe's front
+    plane: IrradianceGrid  # grid over the plane around it
+    reach: mi.Float  # half the width of the plane's grid, mm
 
     @classmethod
     @recorded
     def build(cls, frame: DeviceFrame, reach: mi.Float, points: mi.UInt32, gridded: bool) -> GlobeIrradiance:
         """Fill the grids.
 
-        Args:
-            frame: the frame.
-            reach: distance (mm) from the axis of the unrotated eye within which the plane is visible.
-            points: number of points that represent a lamp.
-            gridded: whether the lamps are small enough for grids.
+        `reach`: distance (mm) from the axis of the unrotated eye within which the plane is visible; `points`: number of
+        points that represent a lamp; `gridded`: whether the lamps are small enough for grids.
         """
         if not gridded:
             return cls(globe=IrradianceGrid.unknown(_SIDE), plane=IrradianceGrid.unknown(_SIDE), reach=reach)

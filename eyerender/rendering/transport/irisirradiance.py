@@ -34,19 +34,12 @@ _AHEAD_MM = 1.0  # distance in front of the back of the cornea, within which nod
 
 @dataclass(kw_only=True)
 class IrisIrradiance:
-    """Irradiance of the lamps in the plane of the iris.
+    """Irradiance of the lamps in the plane of the iris."""
 
-    Attributes:
-        grid: irradiance of the lamps that neither the rim nor anything else attenuates.
-        by_path: bit mask per cell of the other lamps whose paths are known.
-        clear: bit mask per cell of lamps that nothing hides.
-        paths: the numbers of each lamp's path (see `_at_nodes`), each at four nodes in a row.
-    """
-
-    grid: IrradianceGrid
-    by_path: mi.UInt32
-    clear: mi.UInt32
-    paths: mi.Float
+    grid: IrradianceGrid  # irradiance of the lamps that neither the rim nor anything else attenuates
+    by_path: mi.UInt32  # bit mask per cell of the other lamps whose paths are known
+    clear: mi.UInt32  # bit mask per cell of lamps that nothing hides
+    paths: mi.Float  # the numbers of each lamp's path (see `_at_nodes`), each at four nodes in a row
 
     @classmethod
     def build(cls, frame: DeviceFrame, lamps: int, points: mi.UInt32) -> IrisIrradiance:

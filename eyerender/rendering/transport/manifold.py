@@ -62,28 +62,19 @@ class Target:
 
 @syntax
 def connect(
-    surfaces: tuple[DeviceSurface, ...],
-    lamp: mi.Vector3f,
-    target: Target,
-    reach: mi.Float,
-    active: mi.Bool,
+    surfaces: tuple[DeviceSurface, ...],  # refracting surfaces, from the front
+    lamp: mi.Vector3f,  # points on the lamps
+    target: Target,  # points behind the surfaces
+    reach: mi.Float,  # radius about the front surface's axis (mm) beyond which no path enters
+    active: mi.Bool,  # active lanes
     *,
-    mirror: bool = False,
+    mirror: bool = False,  # whether the targets lie in front of a single surface that mirrors the light
+    # how far in front of the last surface targets may lie; they are met by extending the path backwards
     ahead_mm: float = 0.0,
+    # whether the first surfaces are those of lenses, so that paths end at the horizon of a later one
     lensed: bool = False,
 ) -> LampConnection:
-    """Solve for paths from `lamp` to `target` through all `surfaces`; points in the eye frame (mm).
-
-    Args:
-        surfaces: refracting surfaces, from the front.
-        lamp: points on the lamps.
-        target: points behind the surfaces.
-        reach: radius about the front surface's axis (mm) beyond which no path enters.
-        active: active lanes.
-        mirror: whether the targets lie in front of a single surface that mirrors the light.
-        ahead_mm: how far in front of the last surface targets may lie; they are met by extending the path backwards.
-        lensed: whether the first surfaces are those of lenses, so that paths end at the horizon of a later one.
-    """
+    """Solve for paths from `lamp` to `target` through all `surfaces`; points in the eye frame (mm)."""
     front = surfaces[0]
     y = (_mirror_guess if mirror else _entry_guess)(front, lamp, target.aim)
     last, steps, transfer = mi.Vector3f(y), mi.UInt32(0), mi.Float(0)

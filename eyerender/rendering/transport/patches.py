@@ -29,34 +29,22 @@ _LID_MM = 4.0  # distance from the sclera's sphere to the outside of a lid over 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SkinPatches(ArrayValue):
-    """Vertices of a region that represent the skin around them; they move with the tissue.
+    """Vertices of a region that represent the skin around them; they move with the tissue."""
 
-    Attributes:
-        vertices: (n,) indices of the vertices.
-        nearest: (all vertices,) patch that represents each vertex.
-        lids: (l,) patches on the skin right in front of the globe, whose inner sides enclose the space around the
-            cornea.
-        behind: (all vertices,) index in `lids` of the patch for the inner side of each; -1 for none.
-        near: (all vertices, k) patches around every vertex.
-        weight: (all vertices, k) their weights there.
-    """
-
-    vertices: Ints
-    nearest: Ints
+    vertices: Ints  # (n,) indices of the vertices
+    nearest: Ints  # (all vertices,) patch that represents each vertex
+    # (l,) patches on the skin right in front of the globe, whose inner sides enclose the space around the cornea
     lids: Ints
-    behind: Ints
-    near: Ints
-    weight: Singles
+    behind: Ints  # (all vertices,) index in `lids` of the patch for the inner side of each; -1 for none
+    near: Ints  # (all vertices, k) patches around every vertex
+    weight: Singles  # (all vertices, k) their weights there
 
 
 def skin_patches(mesh: RegionMesh, globe: Globe) -> SkinPatches:
     """Choose patches on a region's mesh: one for each cell of a grid that grows with the distance from the eye.
 
-    On the lid margins the cells are smaller, above all across the margin.
-
-    Args:
-        mesh: the region with the eye straight ahead and open lids.
-        globe: the globe in that pose.
+    On the lid margins the cells are smaller, above all across the margin. `mesh`: the region with the eye straight
+    ahead and open lids; `globe`: the globe in that pose.
     """
     ends = mesh.layout.vertex_ends
     solid = np.arange(ends[0])
@@ -119,21 +107,15 @@ class GlobePatches(ArrayValue):
 
     Between lids, columns have constant y and rows divide the opening. On a bare globe, the grid covers its front in
     azimuthal equidistant projection.
-
-    Attributes:
-        points: (rows * columns, 3) mm.
-        normals: (rows * columns, 3) unit normals of the sclera's sphere.
-        table: numbers from which the kernels compute a point's position in the grid: centre 3, first y, columns per mm,
-            then the lower and upper end of each column (mm).
-        columns: number of columns.
-        rows: number of rows.
     """
 
-    points: Floats
-    normals: Floats
+    points: Floats  # (rows * columns, 3) mm
+    normals: Floats  # (rows * columns, 3) unit normals of the sclera's sphere
+    # numbers from which the kernels compute a point's position in the grid: centre 3, first y, columns per mm, then the
+    # lower and upper end of each column (mm)
     table: Floats
-    columns: int
-    rows: int
+    columns: int  # number of columns
+    rows: int  # number of rows
 
 
 def globe_patches(globe: Globe, mesh: RegionMesh | None) -> GlobePatches:

@@ -25,60 +25,35 @@ from .radiosityfield import RadiosityField
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchLight:
-    """Light that is known before the radiosity is solved, on the host, and the hits of the patches' rays.
+    """Light that is known before the radiosity is solved, on the host, and the hits of the patches' rays."""
 
-    Attributes:
-        direct: (outside,) direct irradiance of the patches outside the eye from the lamps.
-        bare: (outside,) the same without shadows.
-        mirrored: (outside,) irradiance from lamps mirrored by the cornea.
-        soft: (outside,) irradiance from uniform light and the soft part of a map, without shadows.
-        hard: (outside,) irradiance from the rest of the map and from panels, without shadows.
-        hard_free: (outside,) the same, from the lamps that represent panels and map.
-        hard_lit: (outside,) the same, with shadows.
-        lamps: (inside,) direct irradiance of the patches of the chamber from the lamps.
-        panels: (inside,) the same, from the lamps that represent panels and map.
-        rays: hits of the rays of all patches.
-    """
-
-    direct: Floats
-    bare: Floats
-    mirrored: Floats
-    soft: Floats
-    hard: Floats
-    hard_free: Floats
-    hard_lit: Floats
-    lamps: Floats
-    panels: Floats
-    rays: PatchRays
+    direct: Floats  # (outside,) direct irradiance of the patches outside the eye from the lamps
+    bare: Floats  # (outside,) the same without shadows
+    mirrored: Floats  # (outside,) irradiance from lamps mirrored by the cornea
+    soft: Floats  # (outside,) irradiance from uniform light and the soft part of a map, without shadows
+    hard: Floats  # (outside,) irradiance from the rest of the map and from panels, without shadows
+    hard_free: Floats  # (outside,) the same, from the lamps that represent panels and map
+    hard_lit: Floats  # (outside,) the same, with shadows
+    lamps: Floats  # (inside,) direct irradiance of the patches of the chamber from the lamps
+    panels: Floats  # (inside,) the same, from the lamps that represent panels and map
+    rays: PatchRays  # hits of the rays of all patches
 
 
 @dataclass(kw_only=True)
 class Gathered:
-    """The fields of `PatchLight` on the device; those of lamps have one item per point on the lamps' discs.
+    """The fields of `PatchLight` on the device; those of lamps have one item per point on the lamps' discs."""
 
-    Attributes:
-        direct: irradiance with and without shadows.
-        mirrored: irradiance from lamps mirrored by the cornea.
-        soft: as in `PatchLight`; None without ambient light.
-        hard: as in `PatchLight`; None without ambient light.
-        panels_outside: irradiance of outside patches from panels, with and without shadows; None without panels.
-        lamps: irradiance of patches of the chamber, column after column.
-        panels: the same, from panels.
-        hits: hits of the rays.
-        lit: irradiance at the points of the skin hit by rays of globe and chamber; None if unused.
-        bare: unshadowed irradiance at the points of the skin hit by all rays; None without skin.
-    """
-
-    direct: list[tuple[mi.Float, mi.Float]]
-    mirrored: list[mi.Float]
-    soft: mi.Float | None
-    hard: mi.Float | None
+    direct: list[tuple[mi.Float, mi.Float]]  # irradiance with and without shadows
+    mirrored: list[mi.Float]  # irradiance from lamps mirrored by the cornea
+    soft: mi.Float | None  # as in `PatchLight`; None without ambient light
+    hard: mi.Float | None  # as in `PatchLight`; None without ambient light
+    # irradiance of outside patches from panels, with and without shadows; None without panels
     panels_outside: tuple[mi.Float | None, mi.Float | None]
-    lamps: list[list[mi.Float]]
-    panels: list[list[mi.Float]]
-    hits: RayHits
-    lit: mi.Float | None
-    bare: mi.Float | None
+    lamps: list[list[mi.Float]]  # irradiance of patches of the chamber, column after column
+    panels: list[list[mi.Float]]  # the same, from panels
+    hits: RayHits  # hits of the rays
+    lit: mi.Float | None  # irradiance at the points of the skin hit by rays of globe and chamber; None if unused
+    bare: mi.Float | None  # unshadowed irradiance at the points of the skin hit by all rays; None without skin
 
     def read(self, patches: FramePatches, lanes: Lanes) -> PatchLight:
         """Copy the light to the host, after all launches have finished."""

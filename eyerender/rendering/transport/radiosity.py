@@ -47,25 +47,15 @@ class PendingField:
     @classmethod
     def gather(
         cls,
-        cache: Patches,
-        frame: DeviceFrame,
-        job: RenderJob,
-        lamps: LampTable,
-        panels: LampTable,
-        globe: GlobePatches,
-        place: Background | RegionScene,
+        cache: Patches,  # patches that do not change between frames of a subject
+        frame: DeviceFrame,  # the frame, with the region and the ambient light
+        job: RenderJob,  # its job
+        lamps: LampTable,  # its lamps
+        panels: LampTable,  # parts of its panels, and the bright parts of its map, as lamps
+        globe: GlobePatches,  # the patches of the globe
+        place: Background | RegionScene,  # its surroundings
     ) -> PendingField:
-        """Start computing the direct light on the patches of a frame, and the form factors between them.
-
-        Args:
-            cache: patches that do not change between frames of a subject.
-            frame: the frame, with the region and the ambient light.
-            job: its job.
-            lamps: its lamps.
-            panels: parts of its panels, and the bright parts of its map, as lamps.
-            globe: the patches of the globe.
-            place: its surroundings.
-        """
+        """Start computing the direct light on the patches of a frame, and the form factors between them."""
         region = place if isinstance(place, RegionScene) else None
         patches = cache.of(job, globe, region)
         field = RadiosityField.dark(job.interreflection, patches.interior.chamber, globe, patches.plane)

@@ -24,38 +24,23 @@ class RadiosityField:
     Patches of globe and background have four numbers each: irradiance from other surfaces, visible share of the sky,
     total irradiance (for mirror images of the patch), and 0. Without interreflection, surfaces give no light and the
     whole sky is visible. The numbers of the skin are stored at its vertices (`SkinGeometry.received`).
-
-    Attributes:
-        on: whether there is interreflection.
-        between: whether the grid of patches on the globe lies between lids.
-        columns: columns of that grid.
-        rows: rows of that grid.
-        centre: centre of the globe (scene's frame, mm).
-        first: y (mm) of the first column between lids.
-        per_mm: columns per mm.
-        ends: lower and upper end of each column (mm).
-        root2: squared radius of the root of the iris, mm^2.
-        reach2: squared reach of the chamber, mm^2.
-        plane: y and z of the centre of the background's rings, and the radius of the first (mm).
-        globe: four numbers for each patch of the globe.
-        background: four numbers for each patch of the background's plane.
-        iris: one number for each patch of the iris.
     """
 
-    on: mi.Bool
-    between: bool
-    columns: int
-    rows: int
-    centre: mi.Vector3f
-    first: mi.Float
-    per_mm: mi.Float
-    ends: mi.Float
-    root2: mi.Float
-    reach2: mi.Float
+    on: mi.Bool  # whether there is interreflection
+    between: bool  # whether the grid of patches on the globe lies between lids
+    columns: int  # columns of that grid
+    rows: int  # rows of that grid
+    centre: mi.Vector3f  # centre of the globe (scene's frame, mm)
+    first: mi.Float  # y (mm) of the first column between lids
+    per_mm: mi.Float  # columns per mm
+    ends: mi.Float  # lower and upper end of each column (mm)
+    root2: mi.Float  # squared radius of the root of the iris, mm^2
+    reach2: mi.Float  # squared reach of the chamber, mm^2
+    # y and z of the centre of the background's rings, and the radius of the first (mm)
     plane: tuple[mi.Float, mi.Float, mi.Float]
-    globe: mi.Float
-    background: mi.Float
-    iris: mi.Float
+    globe: mi.Float  # four numbers for each patch of the globe
+    background: mi.Float  # four numbers for each patch of the background's plane
+    iris: mi.Float  # one number for each patch of the iris
 
     @classmethod
     def dark(cls, on: bool, chamber: Chamber, globe: GlobePatches, plane: tuple[float, float, float]) -> RadiosityField:

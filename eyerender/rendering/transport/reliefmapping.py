@@ -42,38 +42,23 @@ _SPARE_MM, _RAISED_MM = 0.1, 0.2
 
 @dataclass(kw_only=True)
 class ReliefShape:
-    """The heights of an iris on a grid, which do not depend on the pose.
+    """The heights of an iris on a grid, which do not depend on the pose."""
 
-    Attributes:
-        heights: heights of the cells, mm.
-        corners: the heights of the four corners of every cell, side by side.
-        slopes: slopes of the cells along the grid's rows and columns.
-        steepest: largest slope.
-        highest: largest height, mm.
-        near: largest height around each block of cells, as far as all but very slanting light comes from, mm.
-    """
-
-    heights: mi.Float
-    corners: mi.Float
-    slopes: tuple[mi.Float, mi.Float]
-    steepest: mi.Float
-    highest: mi.Float
-    near: mi.Float
+    heights: mi.Float  # heights of the cells, mm
+    corners: mi.Float  # the heights of the four corners of every cell, side by side
+    slopes: tuple[mi.Float, mi.Float]  # slopes of the cells along the grid's rows and columns
+    steepest: mi.Float  # largest slope
+    highest: mi.Float  # largest height, mm
+    near: mi.Float  # largest height around each block of cells, as far as all but very slanting light comes from, mm
 
 
 @dataclass(kw_only=True)
 class ReliefGrid:
-    """A square grid over the plane of the iris, whose values are bilinear between its nodes.
+    """A square grid over the plane of the iris, whose values are bilinear between its nodes."""
 
-    Attributes:
-        stop: the aperture stop, in whose plane the grid lies.
-        half: half its width, mm.
-        count: number of nodes along a side.
-    """
-
-    stop: StopParameters
-    half: mi.Float
-    count: mi.UInt32
+    stop: StopParameters  # the aperture stop, in whose plane the grid lies
+    half: mi.Float  # half its width, mm
+    count: mi.UInt32  # number of nodes along a side
 
     def nodes(self, number: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the columns and rows of all nodes, row by row."""
@@ -112,19 +97,12 @@ class ReliefGrid:
 
 @dataclass(kw_only=True)
 class IrisRelief:
-    """Height of the iris above its plane, and lamp light on it, on a grid over the plane.
+    """Height of the iris above its plane, and lamp light on it, on a grid over the plane."""
 
-    Attributes:
-        count: number of nodes along a side of the grid.
-        raised: whether the iris has any heights.
-        heights: heights at the corners of the cells, mm.
-        shades: the q of the module's docstring at the corners.
-    """
-
-    count: mi.UInt32
-    raised: mi.Bool
-    heights: mi.Float
-    shades: mi.Float
+    count: mi.UInt32  # number of nodes along a side of the grid
+    raised: mi.Bool  # whether the iris has any heights
+    heights: mi.Float  # heights at the corners of the cells, mm
+    shades: mi.Float  # the q of the module's docstring at the corners
 
     @classmethod
     def build(
@@ -155,11 +133,8 @@ class IrisRelief:
     def hit(self, frame: DeviceFrame, x: mi.Vector3f, slant: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Compute where rays meet the relief, as the foot of that point in the plane (eye frame).
 
-        Args:
-            frame: the frame.
-            x: points where the rays would meet the plane.
-            slant: their lateral motion per mm of height above it.
-            active: active lanes.
+        `x`: points where the rays would meet the plane; `slant`: their lateral motion per mm of height above it;
+        `active`: active lanes.
         """
         active &= self.raised
         grid, z = relief_grid(frame, self.count), mi.Float(0)

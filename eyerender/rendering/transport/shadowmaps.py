@@ -37,17 +37,11 @@ _LARGEST = 0.85  # half the width of a map: tan of half the angle to the axis
 
 @dataclass(kw_only=True)
 class ShadowMaps:
-    """Shadow maps of all lamps for one pose of a region, on the device.
+    """Shadow maps of all lamps for one pose of a region, on the device."""
 
-    Attributes:
-        table: numbers of the lamps' views (see `shadow_map_table`).
-        known: whether the sheet is known to be one surface; otherwise every cell counts as marked.
-        marks: 1 for marked cells of each map, else 0.
-    """
-
-    table: mi.Float
-    known: mi.Bool
-    marks: mi.UInt8
+    table: mi.Float  # numbers of the lamps' views (see `shadow_map_table`)
+    known: mi.Bool  # whether the sheet is known to be one surface; otherwise every cell counts as marked
+    marks: mi.UInt8  # 1 for marked cells of each map, else 0
 
     @classmethod
     def build(cls, region: RegionScene, table: Singles) -> ShadowMaps:
@@ -240,10 +234,8 @@ class _Edge:
 def shadow_map_table(lights: Sequence[Lamp], anchor_mm: Floats, reach_mm: float) -> Singles:
     """Compute the projections of lamps (lamps, 16) on the host.
 
-    Args:
-        lights: the lamps.
-        anchor_mm: origin of the scene's frame in the world.
-        reach_mm: distance from this origin within which skin matters.
+    `lights`: the lamps; `anchor_mm`: origin of the scene's frame in the world; `reach_mm`: distance from this origin
+    within which skin matters.
     """
     rows = [_frame(lamp, anchor_mm, min(reach_mm, _REACH_MM)) for lamp in lights]
     return np.array(rows, dtype=np.float32).reshape(-1, _WIDTH)

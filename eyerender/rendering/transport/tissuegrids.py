@@ -26,17 +26,11 @@ _FINEST_MM = 0.02  # smallest size of a cell; at the corners of the eye cells ar
 
 @dataclass(frozen=True, slots=True)
 class Bilinear:
-    """Bilinear interpolation in a grid: the four cells around each position, and its place between them.
+    """Bilinear interpolation in a grid: the four cells around each position, and its place between them."""
 
-    Attributes:
-        numbers: upper left, upper right, lower left and lower right cell.
-        across: 0 at the left cells to 1 at the right ones.
-        down: 0 at the upper cells to 1 at the lower ones.
-    """
-
-    numbers: tuple[mi.UInt32, ...]
-    across: mi.Float
-    down: mi.Float
+    numbers: tuple[mi.UInt32, ...]  # upper left, upper right, lower left and lower right cell
+    across: mi.Float  # 0 at the left cells to 1 at the right ones
+    down: mi.Float  # 0 at the upper cells to 1 at the lower ones
 
     def interpolate(self, kind: Any, buffer: mi.Float, each: mi.UInt32 | int = 1, which: mi.UInt32 | int = 0) -> Any:
         """Interpolate the numbers of cells; every cell has `each` numbers."""
@@ -82,23 +76,15 @@ class SheetSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SheetGrid:
-    """The grid over a posed sheet of skin.
+    """The grid over a posed sheet of skin."""
 
-    Attributes:
-        rows: number of its rows.
-        columns: number of its columns, which form a closed ring.
-        size: rows and columns on the device.
-        cells: numbers of its cells that matter, and of the surrounding cells on the grid reduced by 2 and by 4.
-        edges: row of the sheet's vertices at the edges of the grid's rows.
-        middles: row of the sheet's vertices in the middles of the grid's rows.
-    """
-
-    rows: int
-    columns: int
-    size: SheetSize
+    rows: int  # number of its rows
+    columns: int  # number of its columns, which form a closed ring
+    size: SheetSize  # rows and columns on the device
+    # numbers of its cells that matter, and of the surrounding cells on the grid reduced by 2 and by 4
     cells: tuple[mi.UInt32, ...]
-    edges: mi.Float
-    middles: mi.Float
+    edges: mi.Float  # row of the sheet's vertices at the edges of the grid's rows
+    middles: mi.Float  # row of the sheet's vertices in the middles of the grid's rows
 
     @classmethod
     def upload(cls, cells: SheetCells) -> SheetGrid:
@@ -116,16 +102,11 @@ class SheetGrid:
 
 @dataclass(frozen=True, slots=True)
 class SheetMetric:
-    """Lengths on a posed sheet of skin, along and across its rows.
+    """Lengths on a posed sheet of skin, along and across its rows."""
 
-    Attributes:
-        size: size of the grid.
-        table: for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a
-            cell (mm). A point x mm along and y mm across is y * (rows per mm) rows and (x - a * rows) * (columns per
-            mm) columns away.
-    """
-
-    size: SheetSize
+    size: SheetSize  # size of the grid
+    # for each row and column of vertices: columns per mm along the row, a, rows per mm across it, size of a cell (mm).
+    # A point x mm along and y mm across is y * (rows per mm) rows and (x - a * rows) * (columns per mm) columns away
     table: mi.Float
 
     @classmethod
@@ -166,19 +147,12 @@ class SheetMetric:
 
 @dataclass(frozen=True, slots=True)
 class GlobeGrid:
-    """Numbers of cells of the grid over the globe.
+    """Numbers of cells of the grid over the globe."""
 
-    Attributes:
-        between: cells between the lids.
-        under: cells under the lids from which light gets there.
-        coarse: cells of the grid reduced by 2 that contain those of `under`.
-        over: index in `coarse` for each cell of `under`.
-    """
-
-    between: mi.UInt32
-    under: mi.UInt32
-    coarse: mi.UInt32
-    over: mi.UInt32
+    between: mi.UInt32  # cells between the lids
+    under: mi.UInt32  # cells under the lids from which light gets there
+    coarse: mi.UInt32  # cells of the grid reduced by 2 that contain those of `under`
+    over: mi.UInt32  # index in `coarse` for each cell of `under`
 
     @classmethod
     def upload(cls, cells: GlobeCells) -> GlobeGrid:
@@ -215,19 +189,12 @@ def _numbers(cells: Ints) -> mi.UInt32:
 
 @dataclass(kw_only=True)
 class Pyramid:
-    """A grid and its reductions, read bilinearly.
+    """A grid and its reductions, read bilinearly."""
 
-    Attributes:
-        rows: number of rows of the finest grid.
-        columns: number of its columns.
-        closed: whether the columns form a closed ring.
-        cells: for each cell of all levels, its own value and those to the right, below, and below right.
-    """
-
-    rows: mi.UInt32
-    columns: mi.UInt32
-    closed: bool
-    cells: mi.Float
+    rows: mi.UInt32  # number of rows of the finest grid
+    columns: mi.UInt32  # number of its columns
+    closed: bool  # whether the columns form a closed ring
+    cells: mi.Float  # for each cell of all levels, its own value and those to the right, below, and below right
 
     @classmethod
     def build(cls, values: mi.Float, rows: mi.UInt32, columns: mi.UInt32, *, closed: bool) -> Pyramid:

@@ -31,25 +31,15 @@ _KEYS = (0x51CA, 0x1A3B)
 
 @dataclass(kw_only=True)
 class TissueScene:
-    """Input of the light on the tissues of a frame.
-
-    Attributes:
-        frame: the frame.
-        relief: slopes of the cells of the skin's grid.
-        wide: whether some lamp is too wide for one point.
-        skin_rays: number of rays to each lamp from cells of the skin.
-        globe_rays: number of rays to each lamp from cells of the globe.
-        lid_loss_per_mm: attenuation of light in a lid.
-        lamps: number of lamps, at least 1.
-    """
+    """Input of the light on the tissues of a frame."""
 
     frame: DeviceFrame
-    relief: mi.Float
-    wide: mi.Bool
-    skin_rays: mi.UInt32
-    globe_rays: mi.UInt32
-    lid_loss_per_mm: mi.Float
-    lamps: int
+    relief: mi.Float  # slopes of the cells of the skin's grid
+    wide: mi.Bool  # whether some lamp is too wide for one point
+    skin_rays: mi.UInt32  # number of rays to each lamp from cells of the skin
+    globe_rays: mi.UInt32  # number of rays to each lamp from cells of the globe
+    lid_loss_per_mm: mi.Float  # attenuation of light in a lid
+    lamps: int  # number of lamps, at least 1
 
 
 @dataclass(kw_only=True)
@@ -153,14 +143,8 @@ def light_on_globe(
 ) -> tuple[mi.Float, mi.Float]:
     """Compute the irradiance of the globe's grid, and the share of each lamp that cells see.
 
-    Cells under the conjunctiva receive the light that falls on it, as if it were a part of the globe.
-
-    Args:
-        scene: the scene.
-        grid: the grid.
-        size: size of the grid over the skin.
-        lit: irradiance of that grid.
-        skin: the same after diffusion in the skin.
+    Cells under the conjunctiva receive the light that falls on it, as if it were a part of the globe. `size`: size of
+    the grid over the skin; `lit`: irradiance of that grid; `skin`: the same after diffusion in the skin.
     """
     # Light through a lid varies slowly, so it is computed for two by two cells.
     coarse = dr.zeros(mi.Float, SIDE * SIDE // 4)
