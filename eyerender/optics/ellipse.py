@@ -56,7 +56,7 @@ class Ellipse:
         axes.setflags(write=False)
         object.__setattr__(self, "centre_px", centre)
         object.__setattr__(self, "semi_axes_px", axes)
-        # As in `wrap_angle`: the remainder of a tiny negative angle is rounded up to pi itself.
+        # The remainder of a tiny negative angle is rounded up to pi itself.
         object.__setattr__(self, "angle_rad", 0.0 if angle >= math.pi else angle)
 
     def numbers(self) -> tuple[float, ...]:
@@ -95,14 +95,6 @@ class Ellipse:
         """Compute boundary points (count, 2) at equal steps of the parameter t."""
         return points_on_ellipse(self.centre_px, self.semi_axes_px, self.angle_rad, count)
 
-    def points_at(self, cos_t: Floats, sin_t: Floats) -> Floats:
-        """Compute boundary points (n, 2) at parameters t, given by their cosines and sines (n,)."""
-        a, b = self.semi_axes_px
-        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
-        along, across = a * cos_t, b * sin_t
-        offset = np.stack([along * cos - across * sin, along * sin + across * cos], axis=-1)
-        return np.asarray(self.centre_px + offset)
-
     def shifted(self, offset_px: ArrayLike) -> Ellipse:
         """Move the ellipse by (dx, dy)."""
         return Ellipse(self.centre_px + np.asarray(offset_px, dtype=np.float64), self.semi_axes_px, self.angle_rad)
@@ -128,13 +120,6 @@ class EllipseFit(NamedTuple):
     def ok(self) -> Bools:
         """Whether there is an ellipse, (...)."""
         return np.isfinite(self.residual_px)
-
-
-def wrap_angle(angle_rad: ArrayLike) -> Floats:
-    """Wrap an angle to [0, pi): the orientation of an undirected axis."""
-    wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64), np.pi)
-    # np.mod rounds a tiny negative angle up to pi itself.
-    return np.where(wrapped >= np.pi, 0.0, wrapped)
 
 
 def fit_ellipse_direct(points: ArrayLike) -> EllipseFit:

@@ -207,7 +207,7 @@ def test_uneven_margin_leaves_no_bias():
         )
         phase, size = rng.uniform(0.0, 2.0 * np.pi, 6), rng.uniform(0.5, 1.0, 6)
         size *= 0.32 * np.sqrt(2.0) / np.hypot.reduce(size)
-        outline = ellipse.points_at(np.cos(t), np.sin(t))
+        outline = ellipse.points(len(t))
         normals = pixel_model.nearest(ellipse, *outline.T).normal
         out = sum(a * np.cos(k * t + p) for k, (a, p) in enumerate(zip(size, phase, strict=True), start=3))
         margin = outline + out[:, None] * normals

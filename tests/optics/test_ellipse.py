@@ -25,7 +25,7 @@ def parameters_from_conic(conic):
         scale = 4.0 * level / det
         values, vectors = np.linalg.eigh(np.nan_to_num(_matrices(scale * c, -0.5 * scale * b, scale * a)))
         semi_b, semi_a = np.moveaxis(np.sqrt(values), -1, 0)
-        angle = el.wrap_angle(np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1]))
+        angle = np.mod(np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1]), np.pi)
     real = (det > 0.0) & (level * (a + c) > 0.0)
     nan = np.where(real, 1.0, np.nan)
     return np.stack([cx * nan, cy * nan], axis=-1), np.stack([semi_a * nan, semi_b * nan], axis=-1), angle * nan
@@ -158,7 +158,7 @@ def from_cv2(rotated_rect):
 def _to_cv2(ellipse):
     """OpenCV's rotated rectangle with the minor axis first, as from `cv2.fitEllipse`."""
     a, b = ellipse.semi_axes_px.tolist()
-    degrees = math.degrees(float(el.wrap_angle(ellipse.angle_rad + 0.5 * math.pi)))
+    degrees = math.degrees((ellipse.angle_rad + 0.5 * math.pi) % math.pi)
     return tuple(ellipse.centre_px.tolist()), (2.0 * b, 2.0 * a), degrees
 
 

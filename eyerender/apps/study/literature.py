@@ -31,7 +31,6 @@ GUESTRIN_QUOTED: Final = MappingProxyType({"H1": (0.38, 0.08), "H2": (0.52, 0.14
 PAPER_GUESTRIN: Final = MappingProxyType(
     {"E1": (0.16, 0.16), "E2": (0.41, 0.42), "E3": (0.16, 0.17), "E4": (0.43, 0.44)}
 )
-PAPER_GUESTRIN_E5: Final = 11.0
 
 
 def texts(name: str) -> list[dict[str, str]]:
