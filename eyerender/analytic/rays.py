@@ -81,7 +81,7 @@ def glint_exits(
     """Compute where the light of lamps leaves the cornea, or the lenses in front of it, towards the camera.
 
     The light is reflected at the surface of the given Purkinje image. Images 3 and 4 are seen through the pupil: their
-    status is BEHIND_IRIS where the iris blocks the light on its way in or out. Returns Exit points as three arrays (n,
+    status is BEHIND_IRIS where the iris blocks the light on its way in or out. Returns exit points as three arrays (n,
     m), residuals and status, for lights (n, m).
     """
     if order not in eye.purkinje_orders:
