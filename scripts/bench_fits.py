@@ -316,9 +316,9 @@ def main() -> int:
         return report.finish(options.json, ("eyerender", "numpy", "scipy"))
     for name, rig in rigs().items():
         outcomes = [
-            fitted(rig, preset, count * k + number, options.seed)
-            for k, preset in enumerate(PRESETS)
+            fitted(rig, preset, len(PRESETS) * number + k, options.seed)
             for number in range(count)
+            for k, preset in enumerate(PRESETS)
         ]
         for which, what in enumerate(("targets", "no targets")):
             people_rows(report, name, what, [both[which] for both in outcomes])

@@ -55,6 +55,12 @@ _AXES = {
 """Independent axes of each deviation. An LED's power moves no feature; a mirror moves along its normal."""
 
 
+_MOST = {
+    "rotation_deg": 10.0, "position_mm": 20.0, "focal_length_percent": 20.0, "principal_point_px": 500.0,
+    "power_percent": 100.0,
+}  # fmt: skip
+"""Largest standard deviations (chosen), well beyond those for which errors are linear."""
+
 Quantity = Literal["rotation_deg", "position_mm", "focal_length_percent", "principal_point_px", "power_percent"]
 
 
@@ -74,6 +80,8 @@ class Tolerance(Spec):
         if (self.part, self.quantity) not in _AXES:
             known = [quantity for part, quantity in _AXES if part == self.part]
             raise ValueError(f"a {self.part} has {', '.join(known)}")
+        if self.sd > _MOST[self.quantity]:
+            raise ValueError(f"sd: must be at most {_MOST[self.quantity]:g} for {self.quantity}, not {self.sd:g}")
         return self
 
 

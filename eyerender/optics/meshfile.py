@@ -40,11 +40,9 @@ def read_objects(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
         raise InputError(f"must end with {', '.join(MOST_BYTES)}", source=source)
     data = read_bytes(path, limit=MOST_BYTES[kind])
     options: dict[str, Any] = {}
-    if kind == ".ply":
-        data = plain_ply(data, source=source)
-    elif kind == ".glb":
-        data = _plain_glb(data, source)
-    elif kind == ".obj":
+    if kind in _PLAIN:
+        data = _PLAIN[kind](data, source=source)
+    else:
         data = _plain_obj(data)
         options = {"skip_materials": True, "group_material": False}
         options |= {"split_objects": True} if b"\no " in data else {"split_groups": True} if b"\ng " in data else {}
@@ -90,6 +88,16 @@ def _refuse_many(data: bytes, kind: str, source: str) -> None:
         raise InputError(f"holds {faces} faces; at most {MOST_TRIANGLES} are read", source=source)
 
 
+def _plain_stl(data: bytes, *, source: str) -> bytes:
+    """Return a binary STL without bytes after its last triangle, and text as it is; binary headers may say "solid"."""
+    if b"facet" in data[:1000].lower() or not data.strip():
+        return data
+    end = 84 + 50 * int.from_bytes(data[80:84], "little")
+    if len(data) < end:
+        raise InputError("is not a readable mesh: the .stl file ends before its last triangle", source=source)
+    return data[:end]
+
+
 def _plain_obj(data: bytes) -> bytes:
     """Return the lines of an OBJ with vertices, faces, objects and groups; materials are other files."""
     text = b"\n" + data.decode("utf-8", errors="replace").encode()
@@ -98,7 +106,7 @@ def _plain_obj(data: bytes) -> bytes:
     return re.sub(rb"\n(?!v|f |o |g )[^\n]*", b"", text).replace(b"usemtl ", b" ")
 
 
-def _plain_glb(data: bytes, source: str) -> bytes:
+def _plain_glb(data: bytes, *, source: str) -> bytes:
     """Return a binary glTF file with its triangles alone: no pictures, no extensions and no other files.
 
     Raises:
@@ -130,6 +138,9 @@ def _plain_glb(data: bytes, source: str) -> bytes:
     text += b" " * (-len(text) % 4)
     rest = data[20 + length :]
     return struct.pack("<4sII I4s", _GLB, 2, 20 + len(text) + len(rest), len(text), _JSON) + text + rest
+
+
+_PLAIN = {".ply": plain_ply, ".stl": _plain_stl, ".glb": _plain_glb}
 
 
 def _check(mesh: trimesh.Trimesh, name: str, source: str) -> None:

@@ -15,7 +15,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..base.arrays import ArrayValue, Floats, frozen
 from ..base.spec import EYES, NonNegative, Number, Positive, Side, Spec, Vec3
-from .camera import EyeNames, PinholeCamera, serves
+from .camera import EyeNames, PinholeCamera, facing, serves
 from .mirror import Mirror
 from .timing import ALWAYS_S, Pulse
 
@@ -36,18 +36,46 @@ Aim = Annotated[
 
 
 class LedRing(Spec):
-    """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point.
+    """LEDs evenly spaced on a circle about a camera's axis, in the plane of its nodal point, or about `centre_mm`.
 
     >>> er.Led(ring=er.rig.LedRing(radius_mm=20, count=6)).ring.count
     6
     """
 
     camera: Annotated[int, Field(ge=0)] = Field(default=0, description="the camera that the ring surrounds")
+    centre_mm: Vec3 | None = Field(
+        default=None, description="middle of a ring that surrounds no camera, for example a display lens, in the world"
+    )
+    axis: Vec3 | None = Field(
+        default=None, description="with `centre_mm`: vector along its axis, away from the eye; default: (1, 0, 0)"
+    )
     radius_mm: Positive = Field(description="radius of the circle")
     count: Annotated[int, Field(ge=1, le=MAX_LIGHTS)] = Field(description="number of LEDs on the circle")
     phase_deg: Number = Field(
-        default=0.0, description="angle of the first LED, from the right of the image towards its bottom"
+        default=0.0,
+        description="angle of the first LED, from the right of the image towards its bottom; with `centre_mm`, of the "
+        "image of a camera there that looks against the axis",
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.centre_mm is None and self.axis is not None:
+            raise ValueError("axis is that of a ring with centre_mm")
+        if self.centre_mm is not None and self.camera:
+            raise ValueError("give either camera or centre_mm")
+        if self.axis is not None and not np.linalg.norm(self.axis) > 1e-9:
+            raise ValueError("axis must not be zero")
+        return self
+
+    def places_mm(self, cameras: Sequence[PinholeCamera]) -> list[Floats]:
+        """Compute the places, (3,) mm each, of the LEDs among cameras."""
+        if self.centre_mm is None:
+            camera = cameras[self.camera]
+            middle, (right, down, _) = camera.nodal_point_mm, camera.R
+        else:
+            middle, (right, down, _) = np.array(self.centre_mm), facing(-np.array(self.axis or (1.0, 0.0, 0.0))).T
+        angles = np.radians(self.phase_deg) + 2 * np.pi * np.arange(self.count) / self.count
+        return [middle + self.radius_mm * (np.cos(a) * right + np.sin(a) * down) for a in angles]
 
 
 class Led(Spec):
@@ -63,7 +91,7 @@ class Led(Spec):
         def __init__(self, position_mm: Any = None, **fields: Any) -> None: ...
 
     position_mm: Vec3 | None = Field(default=None, description="place in the world; give this or `ring`")
-    ring: LedRing | None = Field(default=None, description="a circle of LEDs about a camera, in place of one LED")
+    ring: LedRing | None = Field(default=None, description="a circle of LEDs, in place of one LED")
     radius_mm: NonNegative = Field(default=0.0, description="radius of the emitting disc; 0 is a point")
     inner_radius_mm: NonNegative = Field(default=0.0, description="radius of the hole of a ring-shaped emitter")
     aim_mm: Aim = Field(
@@ -124,12 +152,7 @@ class Led(Spec):
             places = [np.array(self.position_mm, dtype=float)]
         else:
             assert self.ring is not None
-            camera = cameras[self.ring.camera]
-            angles = np.radians(self.ring.phase_deg) + 2 * np.pi * np.arange(self.ring.count) / self.ring.count
-            places = [
-                camera.nodal_point_mm + self.ring.radius_mm * (np.cos(a) * camera.R[0] + np.sin(a) * camera.R[1])
-                for a in angles
-            ]
+            places = self.ring.places_mm(cameras)
         share, aims = 1.0, [self._aim(place) for place in places]
         if self.mirror is not None:
             places, share = [self.mirror.image_of(place) for place in places], self.mirror.reflectance

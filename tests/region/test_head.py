@@ -17,6 +17,7 @@ from PIL import Image
 import eyerender as er
 from eyerender.base.errors import InputError
 from eyerender.cli.main import run
+from eyerender.optics.meshfile import read_objects
 from eyerender.region.anatomy import Region
 from eyerender.region.globe import Globe
 from eyerender.region.head import HEAD_PARTS, head_map, load_head, placed, texture_rows
@@ -161,6 +162,43 @@ def test_a_broken_header_of_a_ply_is_one_line(tmp_path, line):
     with pytest.raises(InputError, match=BROKEN[line]) as caught:
         load_head(spec_of(tmp_path, file="a.ply"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_polygons_of_several_sizes_in_a_binary_ply_are_triangles(tmp_path, order):
+    """A prism of two pentagons and five sides, one of which is cut in two; each face has a flag and coordinates."""
+    angle = 2 * np.pi * np.arange(5) / 5
+    corners = [(np.cos(a), np.sin(a), z) for z in (0, 1) for a in angle]
+    sides = [[k, (k + 1) % 5, (k + 1) % 5 + 5, k + 5] for k in range(4)] + [[4, 0, 5], [4, 5, 9]]
+    faces = [[4, 3, 2, 1, 0], [5, 6, 7, 8, 9], *sides]
+    kind = "binary_little_endian" if order == "<" else "binary_big_endian"
+    head = (
+        f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 10\nproperty double x\nproperty double y\n"
+        f"property double z\nelement face {len(faces)}\nproperty uchar flag\nproperty list uchar uint vertex_indices\n"
+        "property list uchar float texcoord\nend_header\n"
+    )
+    body = struct.pack(f"{order}30d", *np.ravel(corners))
+    for face in faces:
+        body += struct.pack(f"{order}BB{len(face)}I", 7, len(face), *face)
+        body += struct.pack(f"{order}B{2 * len(face)}f", 2 * len(face), *([0.5] * 2 * len(face)))
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    ((_, mesh),) = read_objects(tmp_path / "a.ply")
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(2.5 * np.sin(2 * np.pi / 5))
+    (tmp_path / "a.ply").write_bytes(head.encode() + body[:-40])
+    with pytest.raises(InputError, match=r"a\.ply: is not a PLY file that can be read"):
+        read_objects(tmp_path / "a.ply")
+
+
+def test_a_binary_stl_may_have_bytes_behind_its_triangles_and_must_have_all_of_these(tmp_path):
+    data = trimesh.creation.box().export(file_type="stl")
+    for header in (data[:80], b"solid part of a program".ljust(80)):
+        (tmp_path / "a.stl").write_bytes(header + data[80:] + b"more")
+        ((_, mesh),) = read_objects(tmp_path / "a.stl")
+        assert mesh.volume == pytest.approx(1.0)
+    (tmp_path / "a.stl").write_bytes(data[:-1])
+    with pytest.raises(InputError, match=r"a\.stl: .* ends before its last triangle"):
+        read_objects(tmp_path / "a.stl")
 
 
 @pytest.mark.parametrize("content", [b"", b"ply", b"ply\n" * 99, b"ply\nend_header", b"ply\n" + b"comment a\n" * 9999])

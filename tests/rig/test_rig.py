@@ -59,6 +59,28 @@ def test_ring_lies_in_the_nodal_plane_around_the_axis():
     np.testing.assert_allclose(offsets[0], 12 * camera.R[0], atol=1e-12)  # the first is at the image's right
 
 
+def test_a_ring_about_a_display_lens_lies_across_its_axis():
+    """The first LED is where a camera at the centre that looks at the eye has it at the image's right: at +y."""
+    own = {"radius_mm": 22, "count": 8, "centre_mm": [16, -31.5, 0]}
+    places = {
+        name: np.array([lamp.position_mm for lamp in Rig(cameras=[CAMERA], lights=[{"ring": ring}]).build().lights])
+        for name, ring in {"plain": own, "turned": {**own, "axis": [0.5, 0, -0.1], "phase_deg": 90}}.items()
+    }
+    angle = np.pi / 4 * np.arange(8)
+    wanted = [16, -31.5, 0] + 22 * np.column_stack([0 * angle, np.cos(angle), -np.sin(angle)])
+    np.testing.assert_allclose(places["plain"], wanted, atol=1e-12)
+    offsets = places["turned"] - [16, -31.5, 0]
+    np.testing.assert_allclose(offsets @ [0.5, 0, -0.1], 0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), 22, atol=1e-12)
+    assert offsets[0, 1] == pytest.approx(0, abs=1e-12)
+    assert offsets[0, 2] < -21
+    for change, reason in (({"camera": 1}, "either camera or"), ({"axis": [0, 0, 0]}, "must not be zero")):
+        with pytest.raises(InputError, match=reason):
+            Rig(cameras=[CAMERA, CAMERA], lights=[{"ring": {**own, **change}}])
+    with pytest.raises(InputError, match="axis is that of a ring with centre_mm"):
+        Rig(cameras=[CAMERA], lights=[{"ring": {"radius_mm": 22, "count": 8, "axis": [1, 0, 0]}}])
+
+
 def test_light_axis_points_at_its_aim():
     rig = Rig.from_mapping(
         {"cameras": [CAMERA], "lights": [{"position_mm": [100, 0, 0], "aim_mm": [0, 50, 0]}]}

@@ -273,9 +273,8 @@ def ring_note(rig: Rig, light: int) -> str:
         if light < first + count:
             if led.ring is None:
                 return ""
-            return (
-                f"One of a ring of {count} that moves with camera {led.ring.camera}; a change makes them single LEDs."
-            )
+            bound = "" if led.ring.centre_mm is not None else f" that moves with camera {led.ring.camera}"
+            return f"One of a ring of {count}{bound}; a change makes them single LEDs."
         first += count
     return ""
 
