@@ -3,6 +3,7 @@ from . import dataset as dataset
 from . import design as design
 from . import eye as eye
 from . import gaze as gaze
+from . import population as population
 from . import region as region
 from . import rig as rig
 from .analytic.observer import AnalyticObserver as AnalyticObserver

@@ -306,6 +306,8 @@ LARGE = {
     "analytic.view_kernels.project_all": "a kernel",
     "report.eye_section._curve": "a curve and its style",
     "report.overlay.eye_picture": "a picture and its style",
+    # Each is one list: of fields of a file, or of cases of a search.
+    "population.synteyes.eye_file": "fields of an eye file",
 }
 # Records that are rebuilt from a tuple of their fields (batches of surfaces, results of compiled functions), or whose
 # first fields users give in order.

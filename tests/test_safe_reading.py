@@ -60,6 +60,8 @@ EXCEPTIONS = {
     "rig.opencv._archive: zipfile.ZipFile": "bytes that were read",
     "base.storage.files.link_or_copy: open": "a file of this run, which is copied where it cannot be linked",
     "eye.topography._mesh: trimesh.load": "bytes that were read",
+    "population.synteyes._arrays: np.load": "bytes that were read",
+    "population.synteyes._arrays: zipfile.ZipFile": "bytes that were read",
     "rendering.transport.environmentmap._decoded: mi.Bitmap": "by name; `_refuse_size` has checked it",
     "rendering.transport.environmentmap._decoded: np.lib.format.read_array": "an opened file",
     "rendering.scene.exr.write_exr: mi.Bitmap": "an array",

@@ -28,7 +28,7 @@ GROUPS = {
 
 # The namespaces whose names stand on each page, below the package's own.
 NAMESPACES = {
-    "api_eyes": ["eye", "region"],
+    "api_eyes": ["eye", "region", "population"],
     "api_rigs": ["rig"],
     "api_design": ["design"],
     "api_observers": ["apps"],

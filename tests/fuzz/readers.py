@@ -227,6 +227,22 @@ def _mesh(kind: str) -> Callable[[], list[bytes]]:
     return seeds
 
 
+def _synteyes(path: Path) -> Any:
+    from eyerender.population.synteyes import SyntEyes
+
+    return SyntEyes.load(path)
+
+
+def _synteyes_seeds() -> list[bytes]:
+    from eyerender.population.synteyes import _LENS_TERMS, _SHAPES
+
+    arrays = {name: np.ones(shape) for name, shape in _SHAPES.items()} | {_LENS_TERMS: np.ones(10)}
+    arrays["weights_orig"] = np.array([0.5, 0.5]).reshape(_SHAPES["weights_orig"])
+    file = BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    return [file.getvalue()]
+
+
 def _estimator(path: Path) -> Any:
     from eyerender.gaze.store import load_calibration
 
@@ -329,6 +345,7 @@ READERS: dict[str, Reader] = {
     "topography-matrix": Reader("a.csv", _topography("matrix"), _matrix_seeds),
     "ply": Reader("a.ply", _head, _mesh("ply")),
     "obj": Reader("a.obj", _head, _mesh("obj")),
+    "synteyes": Reader("a.npz", _synteyes, _synteyes_seeds),
     "estimator": Reader("a.json", _estimator, _estimator_seeds),
     "cached-map": Reader("a.map", _cached_map, _cached_map_seeds),
     "shard": Reader("a.json", _done, _done_seeds),
