@@ -144,6 +144,8 @@ class LensParameters:
         reach: distance from the frame's origin (mm) from which on rays are moved to the lens before they are traced.
         gain: factor on Fresnel's transmittance of both surfaces.
         edge: weight of rays that meet the edge: 0, or 1 at index 1, where nobody sees it.
+        reflectances: of front and back at every angle; -1: Fresnel's.
+        transmission: of the material.
     """
 
     front: SurfaceParameters
@@ -154,6 +156,8 @@ class LensParameters:
     reach: Number
     gain: Number
     edge: Number
+    reflectances: tuple[Number, Number]
+    transmission: Number
 
 
 @dataclass(frozen=True, slots=True)
