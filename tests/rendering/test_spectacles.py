@@ -314,7 +314,7 @@ def test_lenses_mirror_a_small_panel_as_they_mirror_a_lamp(renderer, lens):
 
 def test_what_lenses_mirror_of_panels_is_in_the_mask_and_behind_the_frame():
     """A panel opposite the lens outshines the eye; the rim, which stands before the lens, hides a part of it."""
-    lens = {"sphere_d": -2.0, "outline_mm": [22, 16]}
+    lens = {"sphere_d": -2.0, "outline_mm": [6, 4.5]}
     panel = {"centre_mm": [300, 40, 60], "size_mm": [400, 400], "radiance_w_m2_sr": 50.0}
     settings = {"ambient": {"panels": [panel]}, "region": {"seed": 3}, "image": {"spp": 8}}
     dull, plain = (render(scene(lens | more, **settings).frames()[0]) for more in ({"reflectance": 0.0}, {}))

@@ -24,7 +24,7 @@ CORNEA_RADIUS_MM = 7.8
 APEX_TO_ROTATION_MM = 13.5
 ROTATION_TO_PUPIL_MM = 10.4
 ROTATION_TO_CORNEA_MM = 5.7
-_WORN_PENALTY = 1.3  # glints that a layout with the scale of spectacles must explain beyond all others
+_WORN_PENALTY = 1.5  # glints that a layout with the scale of spectacles must explain beyond all others
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -123,8 +123,9 @@ def assign_lights(
     distance from the layout's middle (corneas are not spheres).
 
     Every pairing of one glint with one light, and of two with two, proposes a layout. The other glints are then matched
-    one to one. A layout's merit is the number of matches, minus their squared misfits and penalties for its shift and for
-    a scale that no bare eye has. If another layout with different lights comes within 0.25 of the best one, neither is chosen.
+    one to one. A layout's merit is the number of matches, minus their squared misfits and penalties for its shift and
+    for a scale that no bare eye has. If another layout with different lights comes within 0.25 of the best one, neither
+    is chosen.
     """
     glints = np.asarray(glints_px, dtype=np.float64).reshape(-1, 2)
     lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
