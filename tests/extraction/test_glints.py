@@ -409,6 +409,6 @@ def test_layouts_of_eyes_behind_spectacles_are_matched_if_they_explain_more_glin
         assert assign_lights(spots, expected, shift_sd_px=8.0).light.tolist() == [0, 1, 2, 3, 4, -1]
     # Two spots so far apart are one glint and a stray, unless a bare eye can have both.
     pair = expected[:2]
-    stray = pair + [[1.0, -2.0], [16.0, -2.0]]
+    stray = pair + np.array([[1.0, -2.0], [16.0, -2.0]])
     assert assign_lights(stray, pair, shift_sd_px=8.0).light.tolist() == [0, -1]
     assert assign_lights(pair * 1.1, pair, shift_sd_px=8.0).light.tolist() == [0, 1]
