@@ -171,8 +171,6 @@ class DatasetSpec(FileSpec):
         for name in self.variables or {}:
             if not (name.isidentifier() and name.isascii()) or name in FUNCTIONS or keyword.iskeyword(name):
                 raise ValueError(f"variables.{name}: a name must be a plain word that is no function")
-        if {"depth", "normals"} & set(self.labels.geometry or ()) and "spectacles" in self.scene.get("subject", {}):
-            raise ValueError("labels.geometry: depth and normals are not found behind spectacles so far")
         for key in ("population", "person"):
             if key in self.scene:
                 raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")

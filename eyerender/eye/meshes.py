@@ -26,10 +26,12 @@ from typing import Any
 import numpy as np
 
 from ..base.arrays import Floats, Ints
-from ..optics.surfaces import Surface
+from ..optics.surfaces import Surface, components, join
 from .model import EyeModel
+from .worn import WornLens
 
 _LENS_RADIUS_MM = 4.5
+_BEFORE_MM = 100.0  # distance from which the surfaces of worn lenses are met
 _WALL_MM = 1.0
 
 
@@ -122,16 +124,39 @@ def _cap(name: str, surface: Surface, rho: Floats, rings: int, exterior: float, 
     """Compute the part of a surface within radius rho (sectors,) of its axis; faces towards +x, or -x if `inward`."""
     sectors = len(rho)
     angle = 2 * np.pi * np.arange(sectors) / sectors
-    share = np.arange(1, rings + 1) / rings
-    y = np.concatenate([[0.0], (share[:, None] * rho * np.cos(angle)).ravel()])
-    z = np.concatenate([[0.0], (share[:, None] * rho * np.sin(angle)).ravel()])
+    y, z = _disc(rho * np.cos(angle), rho * np.sin(angle), rings)
     local = np.stack([np.asarray(surface.sag(y, z)), y, z], axis=1)
     vertices = local @ surface.rotation.T + surface.origin_mm
-    normals = surface.normal(vertices)
-    faces = _fan(sectors) if rings == 1 else np.concatenate([_fan(sectors), _strips(1, rings, sectors)])
+    normals, faces = surface.normal(vertices), _disc_faces(rings, sectors)
     if inward:
         normals, faces = -normals, faces[:, ::-1]
     return Patch(name, vertices, normals, faces, exterior, interior)
+
+
+def lens_patches(lens: WornLens, name: str, rings: int, sectors: int) -> tuple[Patch, ...]:
+    """Compute front, back and edge of a worn lens inside its outline, in its frame; the edge is opaque."""
+    angle, way = 2 * np.pi * np.arange(sectors) / sectors, -lens.rotation[:, 0]
+    y, z = _disc(lens.half_mm[0] * np.cos(angle), lens.half_mm[1] * np.sin(angle), rings)
+    start = lens.centre_mm + np.stack([np.full(len(y), _BEFORE_MM), y, z], axis=1) @ lens.rotation.T
+    ways, out = components(np.broadcast_to(way, start.shape)), []
+    for side, outer, inner in (("front", 1.0, lens.index), ("back", lens.index, 1.0)):
+        surface = getattr(lens, side)
+        points = join(surface.hit(components(start), ways, True).point)
+        out.append(
+            Patch(f"{name}_{side}", points, surface.normal(points), _disc_faces(rings, sectors), outer, inner)
+        )  # fmt: skip
+    return *out, _band(f"{name}_edge", _rim(out[0], sectors), _rim(out[1], sectors))
+
+
+def _disc(y: Floats, z: Floats, rings: int) -> tuple[Floats, Floats]:
+    """Return places across the axis of a disc's vertices: its middle, then rings up to a rim (sectors,)."""
+    share = np.arange(1, rings + 1)[:, None] / rings
+    a, b = (np.concatenate([[0.0], (share * rim).ravel()]) for rim in (y, z))
+    return a, b
+
+
+def _disc_faces(rings: int, sectors: int) -> Ints:
+    return _fan(sectors) if rings == 1 else np.concatenate([_fan(sectors), _strips(1, rings, sectors)])
 
 
 def _fan(sectors: int) -> Ints:

@@ -114,7 +114,6 @@ def export_scene(
     """
     from ..rendering.output.export import export_scene as write_job
 
-    scene.refuse_spectacles("scenes are exported")
     check_windows(scene)
     frames = scene.frames()
     if side is not None and side not in EYES:

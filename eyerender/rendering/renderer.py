@@ -15,6 +15,7 @@ from .glints.splatting import MirrorImages, Shine
 from .integrator.film import Means, coarse_sensor, mean_radiance, start
 from .integrator.framebuilder import FrameBuilder
 from .integrator.hostdata import BoundFrame, HostData
+from .integrator.lensmirror import mirrored_surroundings
 from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, annotated_parts, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
@@ -92,6 +93,7 @@ class Renderer:
         blur: Blur | None = None
         pictures: dict[int, list[Singles]] = {id(part): [] for part in parts}
         glints: dict[int, list[Shine]] = {id(part): [] for part in parts}
+        in_lenses: dict[int, list[Singles]] = {id(part): [] for part in parts}
         failed = 0
         marks: tuple[Any, ...] | None = None
         rows: list[tuple[Bools, PartLabels]] = []
@@ -104,6 +106,7 @@ class Renderer:
             lit.setdefault(lamps, bound.frame)
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
             means = film.start(bound, blur, part)
+            mirror = mirrored_surroundings(bound, blur.window, film.each, shot.seed)
             if shot is shots[0][0]:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
@@ -114,6 +117,8 @@ class Renderer:
             mirrored, shines = images.seen(surroundings, blur, 1 / len(part.jobs))
             glints[id(part)] += shines
             mean, missed = means()
+            if mirror is not None:
+                in_lenses[id(part)].append(mirror())
             pictures[id(part)].append(mean)
             failed += missed
             if found is not None:
@@ -130,6 +135,7 @@ class Renderer:
                 np.mean(pictures[id(part)], axis=0) if len(part.jobs) > 1 else pictures[id(part)][0],
                 tuple(glints[id(part)]),
                 part.rows,
+                np.mean(in_lenses[id(part)], axis=0) if in_lenses[id(part)] else None,
             )
             for part in parts
         )
@@ -174,10 +180,13 @@ class _Film:
     Args:
         spp: samples per pixel of the whole exposure.
         parts: its moments.
+
+    Attributes:
+        each: samples per pixel of a moment.
     """
 
     def __init__(self, spp: int, parts: Sequence[SubFrames]) -> None:
-        self._spp, self._each = spp, max(1, spp // _shots_of_a_row(parts))
+        self._spp, self.each = spp, max(1, spp // _shots_of_a_row(parts))
         self._still: dict[tuple[float, ...], Singles] = {}
 
     def start(self, bound: BoundFrame, blur: Blur, part: SubFrames) -> Means:
@@ -186,11 +195,11 @@ class _Film:
         base = self._still.get(_lamps(job))
         if base is None:
             stands = _inside(whole, part.moving) != whole
-            means = start(bound, whole, self._spp if stands else self._each, job.seed, layered=blur.layered)
+            means = start(bound, whole, self._spp if stands else self.each, job.seed, layered=blur.layered)
             window = whole
         else:
             window = _inside(whole, part.moving, part.rows)
-            means = start(bound, window, self._each, job.seed, layered=blur.layered)
+            means = start(bound, window, self.each, job.seed, layered=blur.layered)
 
         def read() -> tuple[Singles, int]:
             mean, failed = means()

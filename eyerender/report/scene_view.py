@@ -16,16 +16,15 @@ from .style import ANALYTIC, CAMERA, IMAGE, TARGET, figure
 
 MAX_NOTES = 4
 """Largest number of reasons for missing rays that a figure lists."""
-_LIGHT, _SIGHT, _SCREEN, _OBSTACLE = "#E69F00", "#CC79A7", "#777777", "#555555"
+_LIGHT, _SIGHT, _SCREEN, _OBSTACLE, _LENS = "#E69F00", "#CC79A7", "#777777", "#555555", "#56B4E9"
 
 
 def scene_view(scene: Scene) -> Any:
     """Draw a scene as a matplotlib figure: eyes, screen with targets, cameras, lights, obstacles.
 
-    For the first fixation of the first head position it adds the lines of sight, and the rays of glint and pupil centre
-    to each camera.
+    For the first fixation of the first head position it adds the lines of sight, the rays of glint and pupil centre to
+    each camera (without their bends in spectacles), and the outlines of the spectacles' lenses.
     """
-    scene.refuse_spectacles("scenes are drawn")
     with figure(9.5, 7.5, 1) as (fig, flat):
         flat.remove()
         ax = fig.add_subplot(projection="3d")
@@ -110,6 +109,11 @@ def _eye(ax: Any, scene: Scene, seen: Observations, row: int, *, first: bool) ->
     side = EYES[index.eye[row]]
     eye = scene.eye(side)
     apex = index.eye_position_mm[row] + index.head_mm[row]
+    turn = np.linspace(0.0, 2.0 * np.pi, 49)
+    for k, lens in enumerate(scene.eye(side, tuple(index.head_mm[row])).worn):
+        ring = np.stack([0.0 * turn, lens.half_mm[0] * np.cos(turn), lens.half_mm[1] * np.sin(turn)], axis=1)
+        outline = apex + lens.centre_mm + ring @ lens.rotation.T
+        ax.plot(*outline.T, color=_LENS, lw=1.0, label="spectacles" if first and k == 0 else None)
     centre = apex + eye.sclera.centre_mm
     u, v = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]
     globe = centre[:, None, None] + eye.sclera.radius_mm * np.stack(

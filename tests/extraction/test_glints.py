@@ -399,3 +399,16 @@ def test_every_light_is_used_once(count):
     result = assign_lights(expected + rng.normal(0.0, 0.3, expected.shape), expected, shift_sd_px=5.0)
     assert sorted(result.light.tolist()) == list(range(count))
     assert result.residual_px.max() < 2.0
+
+
+def test_layouts_of_eyes_behind_spectacles_are_matched_if_they_explain_more_glints():
+    """A screen's four lamps and one by the camera, seen 0.78 to 1.4 times as large as in a bare eye; with one stray."""
+    expected = np.array([[-20.0, -14.0], [20.0, -14.0], [20.0, 14.0], [-20.0, 14.0], [1.0, 24.0]])
+    for scale in (0.78, 1.0, 1.3, 1.4):
+        spots = np.concatenate([scale * expected + [2.0, -3.0], [[-31.0, 9.0]]])
+        assert assign_lights(spots, expected, shift_sd_px=8.0).light.tolist() == [0, 1, 2, 3, 4, -1]
+    # Two spots so far apart are one glint and a stray, unless a bare eye can have both.
+    pair = expected[:2]
+    stray = pair + np.array([[1.0, -2.0], [16.0, -2.0]])
+    assert assign_lights(stray, pair, shift_sd_px=8.0).light.tolist() == [0, -1]
+    assert assign_lights(pair * 1.1, pair, shift_sd_px=8.0).light.tolist() == [0, 1]

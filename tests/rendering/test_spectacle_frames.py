@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image, ImageDraw
 from scipy import ndimage
 
 from eyerender.analytic.observer import trace
-from eyerender.base.errors import InputError
 from eyerender.cli.main import main
 from eyerender.eye.frames import frame_body
 from eyerender.folders.imagefolder import ImageFolder
@@ -241,6 +241,15 @@ def test_frames_without_skin_around_the_eye_end_with_one_line(region, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
-def test_export_of_scenes_refuses_lenses(tmp_path):
-    with pytest.raises(InputError, match="scenes are exported without spectacles so far"):
-        export_scene(scene({"sphere_d": -1.0}), tmp_path / "out")
+def test_exported_scenes_hold_lenses_and_frames(tmp_path):
+    """Mitsuba loads them, and meets each lens where its surfaces are; meshes are in the frame of the unrotated eye."""
+    import mitsuba as mi
+
+    done = export_scene(scene({"sphere_d": -4.0}), tmp_path / "out")
+    loaded = {shape.id() for shape in mi.load_file(str(tmp_path / "out" / done["scene"]), optimize=False).shapes()}
+    assert {"spectacles_0_front", "spectacles_0_back", "spectacles_0_edge", "region_spectacle_frame"} <= loaded
+    lens = scene({"sphere_d": -4.0}).eye("right").worn[0]
+    for side in ("front", "back"):
+        mesh = trimesh.load_mesh(tmp_path / "out" / "meshes" / f"spectacles_0_{side}.ply", process=False)
+        assert np.abs(getattr(lens, side).implicit(mesh.vertices)).max() < 1e-3
+        assert (mesh.face_normals @ lens.rotation[:, 0] > 0.5).all()

@@ -21,8 +21,9 @@ from eyerender.optics.shooting import ray_tube
 from eyerender.optics.solve import refracting_path
 from eyerender.optics.surfaces import components, join
 from eyerender.rendering.glints.splatting import MirrorImages
+from eyerender.rendering.integrator.lensmirror import mirrored_surroundings
 from eyerender.scene import Scene
-from eyerender.scene.parts import PUPIL
+from eyerender.scene.parts import PUPIL, SPECTACLES
 from eyerender.scene.spec import SceneSpec
 
 EVEN = {"iris_contrast": 0.0, "limbal_ring": 0.0, "iris": {"relief": 0.0}, "pupil_albedo": 0.0}
@@ -278,3 +279,50 @@ def test_the_command_renders_and_validates(tmp_path):
 def test_meshed_eyes_with_spectacles_are_refused():
     with pytest.raises(Exception, match="meshes of the eye are rendered without spectacles so far"):
         check_windows(scene({"sphere_d": -1.0}, image={"surfaces": "mesh"}))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"sphere_d": -4.0},
+        {"sphere_d": 4.0, "cylinder_d": -1.0, "reflectance": [0.2, 0.1], "transmission": 0.9},
+        [{"sphere_d": -3.0, "pantoscopic_deg": 2.0}, {"sphere_d": 1.0, "vertex_mm": 20.0, "mount": "rig"}],
+    ],
+)
+def test_lenses_mirror_a_small_panel_as_they_mirror_a_lamp(renderer, lens):
+    """Light of the panel is looked up along mirrored rays; places and energies of lamps are exact."""
+    camera = {"position_mm": [100, -40, -10], "look_at_mm": [13, -31.5, 0], "focal_length_px": 1500,
+              "resolution_px": [640, 480]}  # fmt: skip
+    place, side = [300, -10, 30], 6.0
+    lamp = {"position_mm": place, "aim_mm": [13, -31.5, 0], "intensity_mw_sr": side**2, "lobe_exponent": 1.0}
+    panel = {"centre_mm": place, "size_mm": [side, side], "aim_mm": lamp["aim_mm"], "radiance_w_m2_sr": 1000.0}
+    lit = scene(lens, rig={"cameras": [camera], "lights": [lamp]}, ambient={"panels": [panel]})
+    job = render_job(lit.frames(), 0)
+    picture = mirrored_surroundings(renderer.bind(job)[0], job.window, 64, 1)()
+    images = MirrorImages.of(job, None).in_lenses
+    xy = np.concatenate([image.xy_px for image in images])
+    energy = np.array([image.energy.sum() for image in images]) * job.camera.glint_falloff(xy)
+    assert picture.sum() == pytest.approx(energy.sum(), rel=0.005)
+    v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    for (x, y), one in zip(xy, energy, strict=True):
+        near = np.hypot(u - x, v - y) < 12
+        if np.sum(np.hypot(*(xy - (x, y)).T) < 24) == 1:  # apart from all others
+            assert picture[near].sum() == pytest.approx(one, rel=0.01)
+            middle = np.array([(picture * near * u).sum(), (picture * near * v).sum()]) / picture[near].sum()
+            assert np.abs(middle - (x, y)).max() < 0.05
+
+
+def test_what_lenses_mirror_of_panels_is_in_the_mask_and_behind_the_frame():
+    """A panel opposite the lens outshines the eye; the rim, which stands before the lens, hides a part of it."""
+    lens = {"sphere_d": -2.0, "outline_mm": [6, 4.5]}
+    panel = {"centre_mm": [300, 40, 60], "size_mm": [400, 400], "radiance_w_m2_sr": 50.0}
+    settings = {"ambient": {"panels": [panel]}, "region": {"seed": 3}, "image": {"spp": 8}}
+    dull, plain = (render(scene(lens | more, **settings).frames()[0]) for more in ({"reflectance": 0.0}, {}))
+    more, mask = plain.irradiance / dull.irradiance, plain.lens_reflections == 1
+    assert not dull.lens_reflections.any()
+    assert mask.mean() > 0.05
+    assert (more[mask] > 1.5).all()
+    rim = plain.parts == SPECTACLES
+    assert rim.sum() > 100
+    assert np.abs(more[rim] - 1).max() < 0.25  # the lamp's reflection spreads over its edge
+    assert not mask[rim].any()

@@ -29,6 +29,19 @@ def test_legends_name_what_is_drawn():
     assert rig <= legend(scene_view(load_scene("guestrin2006")))
 
 
+def test_spectacles_are_drawn_before_both_eyes():
+    """Their outline is the ellipse of the lens, at the vertex distance from the apex."""
+    lens = {"sphere_d": -3.0, "outline_mm": [25.0, 17.0], "pantoscopic_deg": 0.0, "wrap_deg": 0.0}
+    view = scene_view(load_scene("quickstart").with_({"subject.eyes": ["right", "left"], "subject.spectacles": lens}))
+    rings = [line.get_data_3d() for line in view.axes[0].lines if line.get_color() == "#56B4E9"]
+    assert "spectacles" in legend(view)
+    assert len(rings) == 2
+    for x, y, z in map(np.array, rings):
+        assert np.ptp(x) < 1e-9
+        assert x[0] == pytest.approx(13.0)
+        assert (np.ptp(y), np.ptp(z)) == pytest.approx((50.0, 34.0))
+
+
 def test_left_eye_is_drawn_mirrored():
     right, left = (eye_section(load_eye("E1").build(eye=side)) for side in ("right", "left"))
     fovea = [next(li for li in f.axes[0].lines if li.get_label() == "fovea").get_ydata()[0] for f in (right, left)]

@@ -24,6 +24,7 @@ CORNEA_RADIUS_MM = 7.8
 APEX_TO_ROTATION_MM = 13.5
 ROTATION_TO_PUPIL_MM = 10.4
 ROTATION_TO_CORNEA_MM = 5.7
+_WORN_PENALTY = 1.5  # glints that a layout with the scale of spectacles must explain beyond all others
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -107,6 +108,8 @@ def assign_lights(
     shift_sd_px: float,  # standard deviation of the whole layout's shift
     # limits of the layout's scale; the default corresponds to corneal radii of 6.6 to 9.2 mm instead of 7.8
     scale_range: tuple[float, float] = (0.85, 1.18),
+    # the same behind spectacles of -8 to +7 D, for layouts that explain clearly more glints
+    worn_range: tuple[float, float] = (0.75, 1.45),
     tolerance_px: float = 1.5,  # largest distance in the middle of the layout
     slack: float = 0.08,  # additional distance as a share of the light's distance from the middle
 ) -> Assignment:
@@ -116,8 +119,9 @@ def assign_lights(
     distance from the layout's middle (corneas are not spheres).
 
     Every pairing of one glint with one light, and of two with two, proposes a layout. The other glints are then matched
-    one to one. A layout's merit is the number of matches, minus their squared misfits and a penalty for its shift. If
-    another layout with different lights comes within 0.25 of the best one, neither is chosen.
+    one to one. A layout's merit is the number of matches, minus their squared misfits and penalties for its shift and
+    for a scale that no bare eye has. If another layout with different lights comes within 0.25 of the best one, neither
+    is chosen.
     """
     glints = np.asarray(glints_px, dtype=np.float64).reshape(-1, 2)
     lights = np.asarray(predicted_px, dtype=np.float64).reshape(-1, 2)
@@ -127,8 +131,9 @@ def assign_lights(
     middle = lights.mean(axis=0)
     reach = tolerance_px + slack * np.hypot(*(lights - middle).T)
     search = _Search(
-        glints=glints, lights=lights, middle=middle, reach=reach, scale_range=scale_range, shift_sd=shift_sd_px
-    )
+        glints=glints, lights=lights, middle=middle, reach=reach, scale_range=scale_range, worn_range=worn_range,
+        shift_sd=shift_sd_px,
+    )  # fmt: skip
     found: list[tuple[float, tuple[int, ...], Floats, float]] = []
     for shift, scale in search.promising():
         shift, scale = search.refitted(search.match(shift, scale), shift, scale)
@@ -189,7 +194,8 @@ class _Search:
     lights: Floats  # expected glints of the lights
     middle: Floats  # (2,) middle of the lights
     reach: Floats  # (l,) largest distance of a glint from its light
-    scale_range: tuple[float, float]  # limits of the scale
+    scale_range: tuple[float, float]  # limits of the scale for bare eyes
+    worn_range: tuple[float, float]  # limits of the scale behind spectacles
     shift_sd: float  # standard deviation of the shift
 
     def promising(self) -> list[tuple[Floats, float]]:
@@ -210,12 +216,13 @@ class _Search:
             ratio = (seen * apart).sum(axis=-1) / np.maximum(length2, 1.0)
             halfway = 0.5 * (lights[k] + lights[n]) - middle
             offset = 0.5 * (glints[i] + glints[j])[:, None] - middle - ratio[..., None] * halfway
-            fair = (ratio >= self.scale_range[0]) & (ratio <= self.scale_range[1]) & (length2 > 1.0)
+            fair = (ratio >= self.worn_range[0]) & (ratio <= self.worn_range[1]) & (length2 > 1.0)
             shift, scale = np.concatenate([shift, offset[fair]]), np.concatenate([scale, ratio[fair]])
         placed = middle + shift[:, None] + scale[:, None, None] * (lights - middle)
         gap = glints[None, :, None] - placed[:, None]
         near = (np.hypot(gap[..., 0], gap[..., 1]) / self.reach).min(axis=2)
         merit = np.maximum(1.0 - near**2, 0.0).sum(axis=1) - 0.5 * (shift**2).sum(axis=1) / self.shift_sd**2
+        merit -= self._rarity(scale)
         best = np.argsort(-merit, kind="stable")[:24]
         return [(shift[i], float(scale[i])) for i in best]
 
@@ -241,7 +248,7 @@ class _Search:
         spread = expected - expected.mean(axis=0)
         total = float((spread**2).sum())
         if total > 1.0:
-            scale = float(np.clip((spread * (seen - seen.mean(axis=0))).sum() / total, *self.scale_range))
+            scale = float(np.clip((spread * (seen - seen.mean(axis=0))).sum() / total, *self.worn_range))
         return np.asarray((seen - scale * expected).mean(axis=0) - self.middle), scale
 
     def offsets(self, match: Indices, shift: Floats, scale: float) -> Floats:
@@ -251,9 +258,15 @@ class _Search:
         return np.asarray(self.glints[placed] - expected)
 
     def merit(self, match: Indices, shift: Floats, scale: float) -> float:
-        """Compute how well a layout explains the glints: matches minus squared misfits and a penalty for its shift."""
+        """Compute how well a layout explains the glints: matches minus squared misfits and penalties."""
         misfit2 = (self.offsets(match, shift, scale) ** 2).sum(axis=1) / self.reach[match[match >= 0]] ** 2
-        return float(np.sum(1.0 - misfit2)) - 0.5 * float(shift @ shift) / self.shift_sd**2
+        far = 0.5 * float(shift @ shift) / self.shift_sd**2
+        return float(np.sum(1.0 - misfit2)) - far - float(self._rarity(scale))
+
+    def _rarity(self, scale: ArrayLike) -> Floats:
+        """Return the penalty of scales that only spectacles explain."""
+        low, high = self.scale_range
+        return np.where((np.asarray(scale) < low) | (np.asarray(scale) > high), _WORN_PENALTY, 0.0)
 
 
 def _contradicts(first: tuple[int, ...], second: tuple[int, ...]) -> bool:

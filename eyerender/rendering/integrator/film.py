@@ -28,6 +28,7 @@ from .bare import is_adaptive, render_adaptively, render_samples
 from .groups import LampTurns, PixelGroup
 from .groupshading import shade_group
 from .hostdata import FINE, PLAIN, WET, BoundFrame, HostData
+from .lensmirror import mirrored_surroundings
 from .sampling import FilmRequest, Pattern, Samples
 from .visibility import TILE, GroupPass, HitTable, trace_region
 
@@ -91,9 +92,16 @@ def coarse_sensor(bound: BoundFrame) -> Callable[[], Singles] | None:
     focal, principal = ((dr.opaque(mi.Float, a), dr.opaque(mi.Float, b)) for a, b in ((fx, fy), (cx, cy)))
     coarse = replace(frame, camera=replace(frame.camera, focal=focal, principal=principal))
     window: Window = (0, 0, -(-width // side), -(-height // side))
-    means = start(BoundFrame(coarse, HostData(job, None)), window, _CELL_SAMPLES, job.seed, layered=False)
+    cells = BoundFrame(coarse, HostData(job, None))
+    means = start(cells, window, _CELL_SAMPLES, job.seed, layered=False)
+    mirror = mirrored_surroundings(cells, window, _CELL_SAMPLES, job.seed)
     down, across = -(-height // block), -(-width // block)
-    return lambda: means()[0].repeat(blocks, axis=0).repeat(blocks, axis=1)[:down, :across]
+
+    def read() -> Singles:
+        mean = means()[0] if mirror is None else means()[0] + mirror()
+        return np.asarray(mean.repeat(blocks, axis=0).repeat(blocks, axis=1)[:down, :across])
+
+    return read
 
 
 def _in_passes(

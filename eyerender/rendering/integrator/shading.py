@@ -140,14 +140,14 @@ def _mirrored(frame: DeviceFrame, si: SurfaceInteraction, d: mi.Vector3f) -> mi.
         seen = frame.ambient_irradiance * dr.inv_pi + frame.caches.ambience.radiance(start, way, wet | film)
     else:
         wet &= frame.caches.radiosity.on
-    mirror = _mirror_of_scene if frame.structure.obstacles else _mirror_of_plane
+    mirror = mirror_of_scene if frame.structure.obstacles else _mirror_of_plane
     return dr.select(wet | film, share * mirror(frame, start, way, wet, film, seen), 0)
 
 
-def _mirror_of_scene(
+def mirror_of_scene(
     frame: DeviceFrame, start: mi.Vector3f, way: mi.Vector3f, wet: mi.Bool, film: mi.Bool, seen: mi.Float
 ) -> mi.Float:
-    """Compute the radiance of skin mirrored by the cornea; `seen` where a ray meets nothing."""
+    """Compute the radiance of skin mirrored by the cornea or a lens (`wet`); `seen` where a ray meets nothing."""
     hit = frame.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), way), coherent=True, active=wet | film)
     surface, met = mi.Float(0), hit.is_valid()
     if frame.region is not None:

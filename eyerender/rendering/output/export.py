@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...base.arrays import OBSTACLE, Floats
+from ...base.arrays import OBSTACLE, SPECTACLE_FRAME, Floats
 from ...base.errors import InputError
-from ...eye.meshes import Patch, eye_meshes
+from ...eye.meshes import Patch, eye_meshes, lens_patches
 from ...eye.model import EyeModel
 from ...region.anatomy import Region
 from ...region.head import load_head, placed
@@ -85,11 +85,8 @@ def export_scene(
         _patch(root, folder, patch, motion, albedo.get(patch.name, 0.0))
     place = np.eye(4)
     place[:3, 3] = job.anchor_mm
-    if job.region is None:
-        _patch(root, folder, _backdrop(look.backdrop_distance_mm), place, look.backdrop_albedo)
-    else:
-        for patch, matte in _region(job, job.region):
-            _patch(root, folder, patch, place, matte)
+    for patch, matte in _surroundings(job, rings, sectors):
+        _patch(root, folder, patch, place, matte)
     for k, body in enumerate(job.obstacles):
         patch = Patch(f"obstacle_{k}", body.vertices, body.normals, body.faces)
         _patch(root, folder, patch, np.eye(4), body.albedo)
@@ -154,6 +151,10 @@ def _notes(job: RenderJob) -> list[str]:
         notes.append(f"The film of tears on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
     if job.ambient.model_copy(update={"sun": None}) != Ambient():
         notes.append("Even light, panels and the surrounding's map are left out.")
+    if any(lens.reflectances or lens.transmission < 1 for lens in job.eye.worn):
+        notes.append(
+            "Coatings and absorption of spectacle lenses are left out: their surfaces have Fresnel's reflectance."
+        )
     notes.append("Textures, the relief of the iris, the limbus' soft rim and its lower height, and the point-spread")
     notes.append("function are left out.")
     if job.region is not None:
@@ -222,17 +223,29 @@ def _lamp(root: ET.Element, k: int, position: Floats, axis: Floats, radius: floa
     _value(emitter, "rgb", "radiance", intensity / (np.pi * radius**2))
 
 
+def _surroundings(job: RenderJob, rings: int, sectors: int) -> list[tuple[Patch, float]]:
+    """Return what stands around the eye, in its unrotated frame, with albedos: background or region, and lenses."""
+    look = job.look
+    around = [(_backdrop(look.backdrop_distance_mm), look.backdrop_albedo)]
+    if job.region is not None:
+        around = _region(job, job.region)
+    for k, lens in enumerate(job.eye.worn):
+        around += [(patch, 0.0) for patch in lens_patches(lens, f"spectacles_{k}", rings, sectors)]
+    return around
+
+
 def _region(job: RenderJob, spec: Region) -> list[tuple[Patch, float]]:
     """Return parts of the eye region, without its menisci, or of the head mesh, each with its mean albedo."""
     globe = job.globe
     mesh = region_mesh(spec, globe) if spec.head is None else placed(load_head(spec.head), globe)
     skin = spec.skin
     albedo = {"lashes": spec.lashes.albedo, "brow": spec.brow.albedo, "tears": 0.75 * skin.wet_albedo}
+    albedo |= {body.part: body.albedo for body in globe.frames if body.part == SPECTACLE_FRAME}
     v, f = ([0, *ends.tolist()] for ends in (mesh.layout.vertex_ends, mesh.layout.face_ends))
     return [
         (
             Patch(
-                f"region_{name}",
+                f"region_{name.replace(' ', '_')}",
                 mesh.vertices[v[k] : v[k + 1]],
                 mesh.normals[v[k] : v[k + 1]],
                 mesh.layout.faces[f[k] : f[k + 1]] - v[k],

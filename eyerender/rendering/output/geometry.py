@@ -2,7 +2,8 @@
 
 The same ray gives the raster labels, so masks have the same bits whether geometry is wanted or not.
 The device finds the surface of each ray in single precision. On the host, in double precision, the ray is intersected
-with the tangent plane there, and on the eye with its exact surface by Newton's method.
+with the tangent plane there, and on the eye with its exact surface by Newton's method. Behind spectacles, whose lenses
+bend the rays, the device's point counts.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
 class Geometry(ArrayValue):
     """What the centres of pixels show; NaN where there is none, None where a kind was not requested."""
 
-    depth: Singles | None  # (height, width) mm along the camera's axis to the first surface; along the ray of a fisheye
+    # (height, width) mm along the camera's axis to the first surface but spectacle lenses; along the ray of a fisheye
+    depth: Singles | None
     # (height, width, 3) its unit normals, in the camera's frame (x right, y down, z forward), to the camera
     normals: Singles | None
     # (height, width, 2) mm toward the nose and up in the plane of the iris, from the centre of the stop, of what the
@@ -163,11 +165,12 @@ def _surface(job: RenderJob, hits: Hits) -> tuple[Singles | None, Singles | None
     assert hits.normal is not None
     shape = job.window[3], job.window[2]
     axes = job.camera.sensor_axes @ job.M  # eye's frame to that of the picture
-    exact = [] if job.mesh_edge_mm is not None else _on_eye(job, hits, axes)
+    bent = bool(job.eye.worn)
+    exact = [] if bent or job.mesh_edge_mm is not None else _on_eye(job, hits, axes)
     nothing = np.flatnonzero((hits.instance == NOTHING) | (hits.instance == FRAME))
     depth, normals = None, None
     if "depth" in job.geometry:
-        reach = _rays(job, axes).to_planes(hits.point, hits.normal)
+        reach = _straight(job, axes, hits.point) if bent else _rays(job, axes).to_planes(hits.point, hits.normal)
         for rows, distance, _ in exact:
             reach[rows] = distance
         reach[nothing] = np.nan
@@ -179,6 +182,12 @@ def _surface(job: RenderJob, hits: Hits) -> tuple[Singles | None, Singles | None
         turned[nothing] = np.nan
         normals = sealed(turned.reshape(*shape, 3))
     return depth, normals
+
+
+def _straight(job: RenderJob, axes: Floats, points: Singles) -> Floats:
+    """Compute the depth (n,) of points (3, n) that are seen through lenses: of where they are, not appear."""
+    gap = points.astype(float) - rotated(job.M.T, job.camera.nodal_point_mm - job.t)[:, None]
+    return np.asarray(np.linalg.norm(gap, axis=0) if job.camera.is_fisheye else axes[2] @ gap)
 
 
 def _on_eye(job: RenderJob, hits: Hits, axes: Floats) -> list[tuple[Indices, Floats, Floats]]:

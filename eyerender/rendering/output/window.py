@@ -73,6 +73,8 @@ class Exposed(ArrayValue):
     picture: Singles  # mean radiance of the pixels, with the border that the lens needs, or its parts
     glints: tuple[Shine, ...]  # light of the lamps' mirror images
     rows: Floats | None = None  # (height,) share of the exposure of each row; None: all of it
+    # (height, width) what worn lenses mirror of the ambient light, with the same border; None for nothing
+    in_lenses: Singles | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -156,6 +158,9 @@ class RawFrame(ArrayValue):
         picture = psf.blur(self.blur.of_pictures(exposed.picture).astype(np.float32), job.sensor.psf_sigma_px)
         add_shines([shine for shine in exposed.glints if not shine.of_lens], picture, job)
         mirrored = np.zeros_like(picture)
+        if exposed.in_lenses is not None:
+            blurred = self.blur.of_reflections(exposed.in_lenses).astype(np.float32)
+            mirrored = psf.blur(blurred, job.sensor.psf_sigma_px)
         add_shines([shine for shine in exposed.glints if shine.of_lens], mirrored, job)
         reflections = mirrored > picture
         picture += mirrored

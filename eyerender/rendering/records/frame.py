@@ -191,16 +191,8 @@ def _device_lens(lens: Any, kinds: tuple[Kind, Kind]) -> DeviceLens:
         DeviceSurface(s.origin, s.axes, s.shape, s.eta, kind)
         for s, kind in zip((lens.front, lens.back), kinds, strict=True)
     )
-    return DeviceLens(
-        front=front,
-        back=back,
-        centre=lens.centre,
-        axes=lens.axes,
-        half=lens.half,
-        reach=lens.reach,
-        gain=lens.gain,
-        edge=lens.edge,
-    )
+    rest = {f.name: getattr(lens, f.name) for f in fields(lens) if f.name not in ("front", "back")}
+    return DeviceLens(front=front, back=back, **rest)
 
 
 HARMONICS = 32  # largest number of coefficients of the pupil's boundary

@@ -247,6 +247,8 @@ def _lens_parameters(lens: WornLens) -> LensParameters:
         reach=float(np.linalg.norm(lens.centre_mm)) + _LENS_REACH_MM,
         gain=gain,
         edge=float(n == 1.0),
+        reflectances=lens.reflectances or (-1.0, -1.0),
+        transmission=lens.transmission,
     )
 
 

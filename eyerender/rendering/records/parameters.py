@@ -128,6 +128,8 @@ class LensParameters:
     reach: Number
     gain: Number  # factor on Fresnel's transmittance of both surfaces
     edge: Number  # weight of rays that meet the edge: 0, or 1 at index 1, where nobody sees it
+    reflectances: tuple[Number, Number]  # of front and back at every angle; -1: Fresnel's
+    transmission: Number  # of the material
 
 
 @dataclass(frozen=True, slots=True)

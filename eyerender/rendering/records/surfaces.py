@@ -24,6 +24,7 @@ from ...optics.formulas import Bend, Jet, Ops, formulas
 from .parameters import Kind
 
 _SETTLED_MM = 0.1
+_AHEAD_MM = 40.0  # farther than from a point in a lens to the surfaces through which its light leaves
 
 DEVICE = formulas(
     Ops(
@@ -207,6 +208,23 @@ class DeviceSurface:
         bend = DEVICE.refract(dl, N, self.eta)
         return o + t * d, self.vector_out(mi.Vector3f(*bend.way)), 1 - self.mirrored(bend), ok & (bend.cosine > 0)
 
+    def mirror(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
+        """Mirror a ray from outside: hit point, direction, reflectance, success."""
+        ol, dl = self.point_in(o), self.vector_in(d)
+        t, ok, N = self.meet(ol, dl)
+        bend, way = DEVICE.refract(dl, N, self.eta), mi.Vector3f(*DEVICE.reflect(dl, N).way)
+        return o + t * d, self.vector_out(way), self.mirrored(bend), ok & (bend.cosine > 0)
+
+    def leave(self, o: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Float, mi.Bool]:
+        """Refract a ray from behind to the outside, as `refract` does; it is traced back from far ahead."""
+        far = o + _AHEAD_MM * d
+        dl = self.vector_in(d)
+        t, ok, N = self.meet(self.point_in(far), -dl)
+        bend = DEVICE.refract(dl, -N, 1 / self.eta)
+        passed = 1 - fresnel(bend.cosine, bend.behind, 1 / self.eta)
+        good = ok & (t > 0) & (t < _AHEAD_MM) & (bend.cosine > 0) & bend.passes
+        return far - t * d, self.vector_out(mi.Vector3f(*bend.way)), passed, good
+
     def on_surface(self, x: mi.Vector3f) -> tuple[mi.Vector3f, NormalForm]:
         """Return the surface point (eye frame) at the local (y, z) of a nearby point, and its form for `bend`."""
         l = self.point_in(x)
@@ -253,6 +271,15 @@ class DeviceSurface:
         return out, share if mirror else 1 - share, bend.cosine
 
 
+class Reflection(NamedTuple):
+    """A camera ray that a lens mirrors: where it meets the lens, where and in which direction it leaves, its share."""
+
+    met: mi.Vector3f
+    leaves: mi.Vector3f
+    way: mi.Vector3f
+    share: mi.Float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceLens:
     """A worn lens on the device; the attributes are those of `LensParameters`."""
@@ -265,6 +292,8 @@ class DeviceLens:
     reach: mi.Float
     gain: mi.Float
     edge: mi.Float
+    reflectances: tuple[mi.Float, mi.Float]
+    transmission: mi.Float
 
     def inside(self, x: mi.Vector3f) -> mi.Bool:
         """Return whether points lie inside the outline."""
@@ -277,7 +306,7 @@ class DeviceLens:
         Origins o, unit directions d, and square roots of weights. Bent rays start as far away as the camera, so that
         distances along them are those from the camera.
         """
-        start = o + dr.maximum(-dr.dot(o, d) - self.reach, 0) * d
+        start = self._near(o, d)
         near, way, first, hit = self.front.refract(start, d)
         enters = hit & self.inside(near) & (dr.dot(near - o, d) > 0)
         far, behind, second, left = self.back.refract(near, way)
@@ -290,6 +319,37 @@ class DeviceLens:
             dr.select(through, behind, d),
             weight * dr.select(through, share, dr.select(stopped, self.edge, 1)),
         )
+
+    def mirror_rays(self, o: mi.Vector3f, d: mi.Vector3f) -> list[Reflection]:
+        """Mirror camera rays in front and back; the back mirrors what passes the front twice, as in `Course.share`."""
+        first, second = self.reflectances
+        start = self._near(o, d)
+        near, out, r, hit = self.front.mirror(start, d)
+        _, way, t, _ = self.front.refract(start, d)
+        met = hit & self.inside(near) & (dr.dot(near - o, d) > 0)
+        far, turned, r2, hit2 = self.back.mirror(near, way)
+        left, back, t2, good = self.front.leave(far, turned)
+        share = dr.select(first < 0, t * t2, dr.square(1 - first)) * self.transmission
+        both = met & hit2 & good & self.inside(far) & self.inside(left)
+        return [
+            Reflection(near, near, out, dr.select(met, dr.select(first < 0, r, first), 0)),
+            Reflection(near, left, back, dr.select(both, share * dr.select(second < 0, r2, second), 0)),
+        ]
+
+    def release(self, ray: Reflection) -> Reflection:
+        """Let mirrored light out through this lens, or straight on beside it."""
+        far, way, first, met = self.back.leave(ray.leaves, ray.way)
+        left, out, second, good = self.front.leave(far, way)
+        met &= self.inside(far)
+        share = dr.select(good & self.inside(left), first * second * self.gain, 0)
+        return Reflection(
+            ray.met, dr.select(met, left, ray.leaves), dr.select(met, out, ray.way),
+            ray.share * dr.select(met, share, 1),
+        )  # fmt: skip
+
+    def _near(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+        """Move origins of camera rays towards the lens, so that single precision suffices."""
+        return o + dr.maximum(-dr.dot(o, d) - self.reach, 0) * d
 
     def shade(self, x: mi.Vector3f, lamp: mi.Vector3f) -> mi.Float:
         """Return the share of light that reaches points from a lamp on straight lines, at normal incidence."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...base.arrays import Floats, Reals
+from ...base.arrays import Floats, Reals, Singles
 from ...region.mesh import RegionMesh
 from ...rig import defocus, psf
 from ...rig.camera import Window
@@ -70,6 +70,13 @@ class Blur:
             size = defocus.confusion_of(job.lens, job.camera, job.sensor, nearness)
             layers.append(defocus.Layer(radiance, coverage, size))
         return defocus.blurred(layers, self.reach)
+
+    def of_reflections(self, picture: Singles) -> Reals:
+        """Blur what worn lenses mirror (height, width), as much as the eye; the result is as that of `of_pictures`."""
+        if not self.layered:
+            return defocus.defocused(picture, self.subject_px)
+        layer = defocus.Layer(picture, np.ones_like(picture), np.full_like(picture, self.subject_px))
+        return defocus.blurred([layer], self.reach)
 
     def of_image(self, nearness: Floats) -> float:
         """Compute the circle of confusion (diameter, px) of a mirror image: rms over its inverse depths (1/mm)."""
