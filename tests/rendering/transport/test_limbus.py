@@ -65,7 +65,7 @@ def test_all_light_of_the_chamber_arrives_or_leaves(model):
     plane, wall = chamber.exchange[:, :PLANE].sum(axis=1), chamber.exchange[:, PLANE:].sum(axis=1)
     share = plane + wall * (beside_wall / index[-1]) ** 2 + away
     share[PLANE:] *= (index[-1] / beside_wall) ** 2
-    # A ray that is mirrored in part and leaves the next time is not followed out, and 224 rays have some noise.
+    # A ray that is mirrored in part and leaves the next time is not followed out, and 256 rays have some noise.
     assert share[:PLANE][chamber.valid[:PLANE]].mean() == pytest.approx(1, abs=3e-3)
     assert share[PLANE:][chamber.valid[PLANE:]].mean() == pytest.approx(1, abs=3e-3)
     edge = slice(PLANE - 3 * TURNS, PLANE)
