@@ -616,7 +616,7 @@ def write_dataset(folder: Path, lines: list[dict[str, Any]], *, spec: dict[str, 
     write_json(folder / DATASET, dataset)
 
 
-RESULTS = 31
+RESULTS = 32
 """Version of what this package computes: records, labels and pixels of the same spec.
 
 A change of the code that changes them raises it. A run that was begun with another version is not resumed.

@@ -114,9 +114,9 @@ def iris_maps(iris: DrawnPattern) -> Singles:
     height += 0.03 * trabeculae - 0.07 * grooves - 0.2 * depth - 0.03 * specks
     albedo = albedo * (1 + 0.45 * trabeculae) * (1 - 0.24 * grooves) * (1 - 0.65 * depth) * (1 - 0.4 * specks)
 
-    # The ruff is the pigment epithelium turned over the margin, a dark beaded seam.
-    beads = np.maximum(0.024 * (1 + 0.6 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
-    albedo = np.clip(albedo * (1 - 0.6 * np.exp(-((s / beads) ** 2))), 0.30, 1.9)
+    # The ruff is the pigment epithelium turned over the margin, a dark seam.
+    beads = np.maximum(0.018 * (1 + 0.35 * _noise(rng, (1, ANGULAR), (0, 1), (30, 75), True)), 0.006)
+    albedo = np.clip(albedo * (1 - 0.45 * np.exp(-((s / beads) ** 2))), 0.30, 1.9)
     area = (MARGIN_MM + s * WIDTH_MM).astype(float)
     albedo /= np.sum(albedo * area) / np.sum(np.broadcast_to(area, shape))
     # Tissue has no edges as sharp as those between the lattice's cells.

@@ -24,6 +24,7 @@ from .anatomy import Lashes, Region
 from .contour import Contour, contour, step, unit
 from .globe import Globe
 from .hairs import SEGMENTS, Hairs, taper
+from .lash_kernels import crossed
 from .lids import CONJUNCTIVA, EDGE_MM, FINE, LID, MARGIN, Sheet, lash_line
 
 _ABOVE_MM = np.minimum(0.03 + 0.06 * np.arange(1, SEGMENTS + 1), 0.2)  # height of points after the root, on the skin
@@ -35,6 +36,7 @@ _NEARLY = 0.2  # share by which the skin that is found may be farther away than 
 _OFF_GLOBE_MM = 0.3  # least distance of the points beyond the root from the globe
 _TIP = 0.15  # radius of the tip over that of the root; the map makes thin tips paler too (`skin.lash_band`)
 _BLOBS = 0.9  # spread of the thickness along a lash with mascara, which dries in lumps (chosen)
+_FIRST_PIECES = 3  # beyond the root, that may meet skin near it
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
 
@@ -146,14 +148,12 @@ def _means(values: Floats, tuft: Ints) -> Floats:
 def lashes(spec: Region, globe: Globe, sheet: Sheet) -> Hairs:
     """Compute the lashes of a posed sheet."""
     p, c = plan(spec.lashes, spec.seed, globe.mirrored), sheet.contour
-    points, straight, fold_back = _grown(spec, p, c, sheet.lash_line)
+    points, straight = _grown(spec, p, c, sheet.lash_line)
     points[:, 1:] = _out_of_skin(globe, sheet, points, straight)
-    if fold_back > 0.2 or spec.moved("wide") > 0:
-        # In the corners of closed lids, and below the fold of wide ones, the nearest skin is a poor guide. A lash that
-        # still crosses it is collapsed to its root.
-        corner = np.flatnonzero((np.abs(np.sin(p.angle)) < 0.75) | (fold_back <= 0.2))
-        stuck = corner[_through_skin(sheet, p.angle[corner], points[corner, 1:])] if len(corner) else corner
-        points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
+    # In corners, between closed lids and below a fold, the nearest skin is a poor guide. Lashes that still cross it are
+    # collapsed to their root.
+    stuck = _through_skin(sheet, p.angle, points[:, 1:])
+    points[stuck, 1:] = points[stuck, :1] + 0.0005 * (straight[stuck, 1:] - points[stuck, :1])
     return Hairs(frozen(points), _radii(spec, p))
 
 
@@ -164,7 +164,7 @@ def free_lashes(spec: Region, globe: Globe) -> Hairs:
     lower lashes, and few lashes that hang before the eye.
     """
     p, c = plan(spec.lashes, spec.seed, globe.mirrored), contour(spec, globe)
-    points, _, _ = _grown(spec, p, c, lash_line(spec, globe, c))
+    points, _ = _grown(spec, p, c, lash_line(spec, globe, c))
     points[:, 1:] = globe.pushed_out(points[:, 1:], _OFF_GLOBE_MM)
     return Hairs(frozen(points * globe.mirror), _radii(spec, p))
 
@@ -174,11 +174,10 @@ def _radii(spec: Region, p: LashPlan) -> Floats:
     return frozen(taper(len(p.angle), thick, np.linspace(0, 1, SEGMENTS + 1), _TIP) * p.stout[:, None] * (1 + p.lumps))
 
 
-def _grown(spec: Region, p: LashPlan, c: Contour, line: Floats) -> tuple[Floats, Floats, float]:
+def _grown(spec: Region, p: LashPlan, c: Contour, line: Floats) -> tuple[Floats, Floats]:
     """Compute the points (n, k, 3) of lashes without skin from a contour and the lash line (columns, 3).
 
-    The other results are the points of straight lashes that lead away from the lid, and how far the lids are closed,
-    from 0 (half open or more) to 1.
+    The other result is the points of straight lashes that lead away from the lid.
     """
     frames = np.concatenate([c.point, line, c.normal, c.away, c.along_lid], axis=1)
     inner, outer, n, m, t = np.split(_at(p.angle, frames), 5, axis=1)
@@ -211,35 +210,17 @@ def _grown(spec: Region, p: LashPlan, c: Contour, line: Floats) -> tuple[Floats,
     points += (p.tight[:, None] * ends**1.5)[..., None] * ((1 - w) * points[led, j] + w * points[led, j + 1] - points)
     ahead = unit(n + 0.4 * np.array([1.0, 0.0, 0.0]))
     straight = root[:, None] + (p.length_mm[:, None] * ends)[..., None] * ahead[:, None]
-    return points, straight, fold_back
+    return points, straight
 
 
 def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
-    """Return whether the first pieces of curves (n, k, 3) cross the sheet near their roots (n,), on either lid.
-
-    The test is that of Moeller and Trumbore.
-    """
+    """Return whether the first pieces of curves (n, k, 3) cross the sheet near their roots (n,), on either lid."""
     n = sheet.vertices.shape[1]
     across = np.rint(angle / (2 * np.pi) * n).astype(int)[:, None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)
     columns = np.concatenate([across, n - across], axis=1) % n
     last = CONJUNCTIVA + MARGIN + LID + (-3 if sheet.contour.openness < 1 else 3)  # of an open lid, with its fold
-    rows = sheet.vertices[CONJUNCTIVA + 2 : last]
-    left, right = np.moveaxis(rows[:, columns], 0, 1), np.moveaxis(rows[:, (columns + 1) % n], 0, 1)
-    a, b, c, d = left[:, :-1], right[:, :-1], left[:, 1:], right[:, 1:]
-    corner = np.concatenate([a, a], axis=1)
-    e1, e2 = np.concatenate([c - a, d - a], axis=1), np.concatenate([d - a, b - a], axis=1)
-    corner, e1, e2 = (np.reshape(v, (len(angle), -1, 3)) for v in (corner, e1, e2))
-    normal = np.cross(e1, e2)
     out = np.zeros(len(angle), dtype=bool)
-    for j in range(min(3, points.shape[1] - 1)):
-        o, way = points[:, j, None], (points[:, j + 1] - points[:, j])[:, None]
-        det = -np.sum(way * normal, axis=-1)
-        det = np.where(np.abs(det) < 1e-12, 1e-12, det)
-        s = o - corner
-        t = np.sum(s * normal, axis=-1) / det
-        moment = np.cross(s, way)
-        u, v = np.sum(e2 * moment, axis=-1) / det, -np.sum(e1 * moment, axis=-1) / det
-        out |= np.any((t >= 0) & (t <= 1) & (u >= 0) & (v >= 0) & (u + v <= 1), axis=1)
+    crossed(points, columns, np.ascontiguousarray(sheet.vertices[CONJUNCTIVA + 2 : last]), _FIRST_PIECES, out)
     return out
 
 

@@ -14,6 +14,7 @@ from . import noise_kernels as kernels
 
 _NEGLIGIBLE = 3.0  # times a band's upper end, where its gain is 1e-4
 _CANDIDATES = 12  # one position in twenty thousand would need more
+_OVERLAP = 2  # rows and columns that `padded` repeats
 
 
 def gain(f: Floats, low: float, high: float) -> Floats:
@@ -100,21 +101,19 @@ def nearest_two(seeds: Floats, x: Floats, y: Floats) -> tuple[Singles, NDArray[n
 
 def padded(tile: Singles) -> Singles:
     """Repeat the first two rows and columns of a periodic tile behind the last ones, for `TilePlaces.sample`."""
-    return np.pad(tile, (0, 2), "wrap")
+    return np.pad(tile, (0, _OVERLAP), "wrap")
 
 
 class TilePlaces:
-    """Positions (x, y) mm on a periodic square, at which tiles of one size are sampled by linear interpolation."""
+    """Positions (x, y) mm on a periodic square, at which tiles of any size are sampled by linear interpolation."""
 
-    def __init__(self, size: int, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
-        self.size = size
+    def __init__(self, x: NDArray[Any], y: NDArray[Any], period_mm: float) -> None:
         self._u, self._v = (np.asarray(c * np.float32(1 / period_mm)) for c in (x, y))
         for turns in (self._u, self._v):
             turns -= np.floor(turns)
-            turns *= np.float32(size)
 
     def sample(self, tile: Singles) -> Singles:
         """Return the values of a `padded` tile at the positions."""
         out = np.empty(self._u.size, np.float32)
-        kernels.sample(tile, self._u.ravel(), self._v.ravel(), out)
+        kernels.sample(tile, np.float32(len(tile) - _OVERLAP), self._u.ravel(), self._v.ravel(), out)
         return out.reshape(self._u.shape)

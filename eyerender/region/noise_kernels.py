@@ -32,18 +32,20 @@ def weigh(waves: Singles, up: Floats, across: Floats, below_up: Floats, below_ac
 
 
 @compiled()
-def sample(tile: Singles, u: Singles, v: Singles, out: Singles) -> None:
-    """Interpolate a tile linearly at positions in texels.
+def sample(tile: Singles, size: np.float32, u: Singles, v: Singles, out: Singles) -> None:
+    """Interpolate a periodic tile linearly.
 
     Args:
-        tile: values; rows lie along v. Two rows and columns more than positions reach.
-        u: positions (k,), not negative.
-        v: positions (k,), not negative.
+        tile: values; rows lie along v, and two more rows and columns repeat the first ones.
+        size: number of rows and columns without these.
+        u: positions (k,) as shares of the period, 0 to 1.
+        v: positions (k,), 0 to 1.
         out: (k,) interpolated values.
     """
     for k in range(len(u)):
-        left, top = np.int32(u[k]), np.int32(v[k])
-        du, dv = u[k] - np.float32(left), v[k] - np.float32(top)
+        x, y = size * u[k], size * v[k]
+        left, top = np.int32(x), np.int32(y)
+        du, dv = x - np.float32(left), y - np.float32(top)
         # Signed indices might count from the end, and the test of that takes as long as the rest.
         column, row = np.uint64(left), np.uint64(top)
         right, below = column + np.uint64(1), row + np.uint64(1)

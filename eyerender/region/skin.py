@@ -40,7 +40,8 @@ _LINE = CONJUNCTIVA + MARGIN - 1  # the lash line's row
 _CREASE = CONJUNCTIVA + MARGIN + LID  # and that of the crease
 _TILE_MM, _TILE = 24.0, 640
 _COARSE = 8
-_SLOW, _SLOW_TILE = 4, 320  # rows and columns of the map from one place of a slow field to the next; side of its tiles
+_SIDES, _PER_WAVE = (80, 160, 320, _TILE), 8  # sides of tiles of noise, and the least texels in the shortest waves
+_SLOW = 4  # rows and columns of the map from one place of a slow field to the next
 _BROW_ENDS, _BROW_STEPS = (-0.25, 1.1), 4096
 _STEEPEST = 2.0  # slope of the map, over the region's frame; margins are seen from their edges
 _STRIP = 32  # number of map rows computed together, so that they stay in the processor's cache
@@ -55,6 +56,7 @@ _MASCARA = 0.03  # albedo of lashes with mascara (chosen)
 _ROOTS_MM, _ROOTS_LOSS, _MANY = (-0.25, 0.45), 0.10, 120 * 0.085
 _WET, _WET_ROOT = 0.97, 0.06  # gloss of wet tissue, and the share of a lash that is wet
 _SHOWN_MM = 25.0  # radius about the middle of the fissure: the skin whose mean albedo is that of the spec
+_Band = tuple[float, int, tuple[float, float], tuple[float, float]]  # factor, number, cycles across and up
 _REFERENCE_BLINK = 0.3  # blink at which the tissue is laid out: neither stretched nor hidden in the fold
 
 
@@ -83,26 +85,29 @@ def _texels() -> Floats:
 
 
 @lru_cache(maxsize=4)
-def skin_map(spec: Region) -> Singles:
-    """Compute the map (rows, columns, 4) of a subject; it does not depend on the blink."""
+def skin_map(spec: Region, grain: int = 1) -> Singles:
+    """Compute the map (rows, columns, 4) of a subject; it does not depend on the blink.
+
+    With a `grain` of 2, the map has half as many rows and columns, which is enough for small images.
+    """
     reference = spec.with_lids(_REFERENCE_BLINK)
     rest = sheet(reference, Globe.sphere()).vertices
-    rows = np.interp(np.arange(SHEET_ROWS), _texels(), np.arange(ROWS))
-    columns = np.arange(_COLUMNS) * (rest.shape[1] / _COLUMNS)
-    out = np.zeros((SHEET_ROWS + BANDS, _COLUMNS, 4), np.float32)
+    rows, columns = ((np.arange(n // grain) + 0.5) * grain - 0.5 for n in (SHEET_ROWS, _COLUMNS))
+    rows, columns = sheet_place(rows), columns * (rest.shape[1] / _COLUMNS)
+    out = np.zeros(((SHEET_ROWS + BANDS) // grain, len(columns), 4), np.float32)
     if spec.skin.map == "off":
-        out[:SHEET_ROWS, :, 0] = spec.skin.albedo
+        out[: len(rows), :, 0] = spec.skin.albedo
     else:
         _draw_sheet(spec, rest, rows, columns, out)
     for which, (a, g) in enumerate(((spec.lashes.albedo, _HAIR_GLOSS), (spec.brow.albedo, _HAIR_GLOSS), (0.0, _WET))):
-        middle = SHEET_ROWS + BANDS * (which + 1) / 4
-        band_rows = slice(int(middle - BANDS / 8), int(middle + BANDS / 8))
+        middle, half = SHEET_ROWS + BANDS * (which + 1) / 4, BANDS / 8
+        band_rows = slice(int((middle - half) / grain), int((middle + half) / grain))
         out[band_rows] = (a, 0, 0, g)
         if which == LASH:
-            out[band_rows, :, 0], out[band_rows, :, 3] = lash_band(spec)
+            out[band_rows, :, 0], out[band_rows, :, 3] = lash_band(spec, len(columns))
         if which == TEAR:
-            out[SHEET_ROWS + SPECTACLES_ROW - 3 :, :, 0] = (np.arange(_COLUMNS) + 0.5) / _COLUMNS
-            out[band_rows, :, 1:3] = waves(spec, _COLUMNS)[:, None] * _along_lids(rest)
+            out[(SHEET_ROWS + SPECTACLES_ROW - 3) // grain :, :, 0] = (np.arange(len(columns)) + 0.5) / len(columns)
+            out[band_rows, :, 1:3] = waves(spec, len(columns))[:, None] * _along_lids(rest, len(columns))
     out.flags.writeable = False
     return out
 
@@ -116,8 +121,8 @@ def _draw_sheet(spec: Region, rest: Floats, rows: Floats, columns: Floats, out: 
     folded = fold_depths(spec.seed, spec.skin.folds, y, z) * step(out_mm, 1.0, 2.5) if spec.skin.folds else None
     some = slice(None, None, _SLOW)
     slow = _Slow(tiles, y[some, some], z[some, some], out_mm[some, some], np.sin(turn[some]) > 0)
-    height = np.empty((SHEET_ROWS, _COLUMNS), np.float32)
-    for first in range(0, SHEET_ROWS, _STRIP):
+    height = np.empty((len(rows), len(columns)), np.float32)
+    for first in range(0, len(rows), _STRIP):
         k = slice(first, first + _STRIP)
         strip = _Strip(
             tiles=tiles,
@@ -130,26 +135,26 @@ def _draw_sheet(spec: Region, rest: Floats, rows: Floats, columns: Floats, out: 
             strip=k,
         )
         out[k, :, 0], out[k, :, 3], height[k] = strip.look(spots[k], None if folded is None else folded[k])
-    _slopes(height, y, z, out[:SHEET_ROWS, :, 1:3])
-    _normalise(out[:SHEET_ROWS, :, 0], y, z, rows, spec.skin.albedo)
+    _slopes(height, y, z, out[: len(rows), :, 1:3])
+    _normalise(out[: len(rows), :, 0], y, z, rows, spec.skin.albedo)
 
 
-def _along_lids(rest: Floats) -> Singles:
+def _along_lids(rest: Floats, columns: int) -> Singles:
     """Compute unit directions (columns, 2) over (y, z) along the margin's inner edge, in the order of the columns."""
     edge = np.concatenate([rest[CONJUNCTIVA], rest[CONJUNCTIVA, :1]])[:, 1:]
     way = np.diff(edge, axis=0)
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-    return np.asarray(way[np.arange(_COLUMNS) * len(way) // _COLUMNS], dtype=np.float32)
+    return np.asarray(way[np.arange(columns) * len(way) // columns], dtype=np.float32)
 
 
-def lash_band(spec: Region) -> tuple[Singles, Singles]:
+def lash_band(spec: Region, columns: int) -> tuple[Singles, Singles]:
     """Compute albedo and gloss (columns,) of lashes, root to tip: upper ones in the first half, then lower ones.
 
     Tips are paler, because they transmit light and because hairs much thinner than a pixel would look stippled. Roots
     are wet with tears.
     """
-    s = np.clip((np.arange(_COLUMNS) + 0.5) / _COLUMNS % 0.5 - LASH_U[0], 0, LASH_U[1]) / LASH_U[1]
-    lower = np.arange(_COLUMNS) >= _COLUMNS // 2
+    u = (np.arange(columns) + 0.5) / columns
+    s, lower = np.clip(u % 0.5 - LASH_U[0], 0, LASH_U[1]) / LASH_U[1], u >= 0.5
     lashes = spec.lashes
     root = np.where(lower, lashes.lower_albedo, lashes.albedo)
     tip = np.where(lower, 0.5 * (lashes.lower_albedo + lashes.tip_albedo) + 0.1, lashes.tip_albedo)
@@ -187,6 +192,11 @@ def skin_texels(spec: Region) -> NDArray[np.float16]:
     return skin_map(spec).astype(np.float16)
 
 
+def coarse_skin_texels(spec: Region) -> NDArray[np.float16]:
+    """Compute the same with every second row and column."""
+    return skin_map(spec, 2).astype(np.float16)
+
+
 def _over_grid(values: Floats, rows: Floats, columns: Floats) -> Singles:
     """Interpolate values (r, c) of a grid linearly at fractional rows (m,) and columns (n,): (m, n)."""
     i, j = np.minimum(rows.astype(int), len(values) - 2), np.minimum(columns.astype(int), values.shape[1] - 2)
@@ -216,8 +226,24 @@ def _bell(x: Singles, middle: float, width: float) -> Singles:
     return np.asarray(np.exp(-np.square((x - middle) * (1 / width))))
 
 
+@lru_cache(maxsize=32)
+def _shared_bands(parts: tuple[_Band, ...]) -> Singles:
+    """Compute fine noise once for all people, because drawing it takes longer than anything else in a map."""
+    return _bands(0, _TILE, parts)
+
+
+def _bands(seed: int, side: int, parts: tuple[_Band, ...]) -> Singles:
+    """Compute a weighted sum of bands of noise (see `noise.band`) on a square of `side` texels."""
+    return reduce(np.add, [factor * band(seed + number, side, *ends) for factor, number, *ends in parts])
+
+
+@lru_cache(maxsize=2)
+def _shared_furrows(cells: int, stretch: float) -> Singles:
+    return furrows(cells, _TILE, cells, stretch)
+
+
 class _Tiles:
-    """Noise of a subject; each tile is computed on first use."""
+    """Noise of a subject; each tile is computed on first use. Fine tiles are those of all people, shifted."""
 
     def __init__(self, spec: Region) -> None:
         self.spec = spec
@@ -227,23 +253,30 @@ class _Tiles:
         """Sample a band of noise (see `noise.band`) at positions."""
         return self.mixed(places, (1.0, number, across, up))
 
-    def mixed(self, places: TilePlaces, *parts: tuple[float, int, tuple[float, float], tuple[float, float]]) -> Singles:
+    def mixed(self, places: TilePlaces, *parts: _Band) -> Singles:
         """Sample a weighted sum of bands of noise at positions."""
-        key = places.size, *parts
-        if key not in self._made:
-            bands = [factor * band(self.spec.seed + number, places.size, *ends) for factor, number, *ends in parts]
-            self._made[key] = padded(reduce(np.add, bands))
-        return places.sample(self._made[key])
+        if parts not in self._made:
+            shortest = max(high for _, _, *ends in parts for _, high in ends)
+            side = next((n for n in _SIDES if n >= _PER_WAVE * shortest), _TILE)
+            shared = side == _TILE
+            tile = _shared_bands(parts) if shared else _bands(self.spec.seed, side, parts)
+            self._made[parts] = self._moved(tile, parts[0][1]) if shared else padded(tile)
+        return places.sample(self._made[parts])
+
+    def _moved(self, tile: Singles, number: int) -> Singles:
+        """Shift a tile that all people share, by an amount of their own."""
+        shift = np.random.default_rng((0x7113, self.spec.seed, number)).integers(len(tile), size=2)
+        return padded(np.roll(tile, shift, axis=(0, 1)))
 
     @cached_property
     def net(self) -> Singles:
         """Return the furrows of the face."""
-        return padded(furrows(self.spec.seed, _TILE, 1700))
+        return self._moved(_shared_furrows(1700, 1.0), 0)
 
     @cached_property
     def drawn(self) -> Singles:
         """Return the furrows of the lids, stretched horizontally."""
-        return padded(furrows(self.spec.seed + 7, _TILE, 1500, 2.5))
+        return self._moved(_shared_furrows(1500, 2.5), 1)
 
     @cached_property
     def hollows(self) -> Singles:
@@ -260,8 +293,8 @@ class _Tiles:
         return low.astype(np.float32), (high - low).astype(np.float32)
 
 
-def _places(y: NDArray[Any], z: NDArray[Any], size: int = _TILE) -> TilePlaces:
-    return TilePlaces(size, y, z, 2 * _TILE_MM)
+def _places(y: NDArray[Any], z: NDArray[Any]) -> TilePlaces:
+    return TilePlaces(y, z, 2 * _TILE_MM)
 
 
 class _Slow:
@@ -276,13 +309,13 @@ class _Slow:
     """
 
     def __init__(self, tiles: _Tiles, y: Singles, z: Singles, out_mm: Singles, upper: Bools) -> None:
-        skin, places = tiles.spec.skin, _places(y, z, _SLOW_TILE)
+        skin, places = tiles.spec.skin, _places(y, z)
 
         def of_lids(number: int, across: tuple[float, float], up: tuple[float, float]) -> Singles:
             """Compute noise over the lids, independent on each lid."""
             out = np.empty_like(y)
             for side, mine in enumerate((upper, ~upper)):
-                at = _places(y[:, mine], out_mm[:, mine], _SLOW_TILE)
+                at = _places(y[:, mine], out_mm[:, mine])
                 out[:, mine] = tiles.at(number + side, at, across, up)
             return out
 
@@ -332,7 +365,7 @@ class _Slow:
 def _hollows(behind: Singles, y: Singles, z: Singles) -> Singles:
     """Compute the loss of light, -0.05 to 0.25, in hollows of the face."""
     y, z = (np.clip(v + 76.0, 0, 151.999) for v in (y, z))
-    return np.asarray(np.clip(0.05 * TilePlaces(153, y, z, 153.0).sample(behind), -0.05, 0.25))
+    return np.asarray(np.clip(0.05 * TilePlaces(y, z, 153.0).sample(behind), -0.05, 0.25))
 
 
 @dataclass(kw_only=True)
@@ -449,16 +482,16 @@ class _Strip:
         The cells are wide on the face. On the lids they are stretched along the margin, like its creases.
         """
         y, z, tiles = self.y, self.z, self.tiles
-        cells = TilePlaces(_TILE, y, z, 0.72 * _TILE_MM).sample(tiles.net)
+        cells = TilePlaces(y, z, 0.72 * _TILE_MM).sample(tiles.net)
         some = self.lids > 1e-4
         if np.any(some):
-            narrow = TilePlaces(_TILE, y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
+            narrow = TilePlaces(y[some], self.level[some] + self.slowly("sway")[some], 0.8 * _TILE_MM)
             cells[some] += self.lids[some] * (narrow.sample(tiles.drawn) - cells[some])
         return np.asarray(1 - (0.2 + 0.8 * self.patch) * (1 - cells))
 
     def bumps(self) -> Singles:
         """Sample the finest relief (mean 0, deviation about 0.8): bumps a quarter of a millimetre wide, in patches."""
-        places = TilePlaces(_TILE, self.y, self.level, _TILE_MM)
+        places = TilePlaces(self.y, self.level, _TILE_MM)
         return self.tiles.at(17, places, (10, 40), (28, 68)) * (0.4 + 0.8 * self.patch)
 
     def relief(self, cells: Singles) -> Singles:

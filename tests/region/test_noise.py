@@ -28,7 +28,7 @@ def test_a_tile_is_sampled_linearly_and_periodically():
     rng = np.random.default_rng(4)
     tile = rng.standard_normal((40, 40)).astype(np.float32)
     x, y = (rng.uniform(-30, 30, (50, 7)).astype(np.float32) for _ in "xy")
-    found = TilePlaces(40, x, y, 20.0).sample(padded(tile))
+    found = TilePlaces(x, y, 20.0).sample(padded(tile))
     wanted = ndimage.map_coordinates(tile.astype(float), [2.0 * y, 2.0 * x], order=1, mode="grid-wrap")
     # Positions have errors of 1e-7 turns, thus of 4e-6 texels.
     np.testing.assert_allclose(found, wanted, atol=5e-5)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+from scipy import ndimage
 
 from eyerender.region.anatomy import Region
 from eyerender.region.folds import fold_depths
 from eyerender.region.globe import Globe
 from eyerender.region.lashes import lashes
 from eyerender.region.lids import CONJUNCTIVA, FACE, LID, MARGIN, ROWS, sheet
-from eyerender.region.skin import SHEET_ROWS, sheet_v, skin_map
+from eyerender.region.skin import SHEET_ROWS, _Tiles, sheet_v, skin_map
 
 
 def at(blink, **more):
@@ -143,3 +144,27 @@ def test_a_skin_without_a_map_is_even_and_matte():
     # The key appears only where it is used, so files and digests of other scenes stay as they are.
     assert "map" not in Region.from_mapping({"skin": {"map": True}}).to_mapping()["skin"]
     np.testing.assert_array_equal(skin_map(even)[SHEET_ROWS:], skin_map(Region(seed=6))[SHEET_ROWS:])  # hairs, tears
+
+
+def test_a_coarse_map_shows_the_same_skin_as_a_fine_one():
+    """Blurred to the same width, albedo and gloss differ by little beside what another person's differ by."""
+    spec = Region.from_mapping({"seed": 6, "skin": {"folds": 0.7, "mottling": 1.0}})
+    fine, coarse, other = skin_map(spec), skin_map(spec, 2), skin_map(spec.model_copy(update={"seed": 7}), 2)
+    assert coarse.shape == (len(fine) // 2, fine.shape[1] // 2, 4)
+    means = fine.reshape(len(coarse), 2, -1, 2, 4).mean(axis=(1, 3))
+    rows = slice(80, SHEET_ROWS // 2)  # of skin
+    for channel in (0, 3):
+        blurred = [ndimage.gaussian_filter(m[rows, :, channel], 2.0) for m in (means, coarse, other)]
+        same, apart = (np.std(m - blurred[0]) for m in blurred[1:])
+        assert same < 0.2 * apart
+    np.testing.assert_allclose(coarse[SHEET_ROWS // 2 :, :, 0], means[SHEET_ROWS // 2 :, :, 0], atol=2e-3)
+
+
+def test_fine_grain_is_shifted_from_person_to_person():
+    one, same, other = (_Tiles(Region(seed=seed)).net[:-2, :-2] for seed in (3, 3, 4))
+    assert np.array_equal(one, same)
+    spectrum = np.fft.rfft2(one - one.mean()).conj() * np.fft.rfft2(other - other.mean())
+    match = np.fft.irfft2(spectrum / np.maximum(np.abs(spectrum), 1e-9), s=one.shape)
+    shift = np.unravel_index(np.argmax(match), match.shape)
+    assert shift != (0, 0)
+    np.testing.assert_array_equal(np.roll(one, shift, axis=(0, 1)), other)

@@ -20,6 +20,7 @@ from ..records.frame import DeviceFrame, Lights, Structure, upload_array
 from ..records.job import LampTable, RenderJob, boundary_waves, kinds, lens_kinds, panel_lamps, panel_table, tables
 from ..records.recording import forget, recorded
 from ..scene.background import Background
+from ..scene.diffusiongrids import skin_grain
 from ..scene.head import HeadScene
 from ..scene.region import RegionScene
 from ..transport.diffusion import DiffusedLight
@@ -241,18 +242,20 @@ class FrameBuilder:
         second eye of a subject gets its own scene at once, because the first eye will return.
         """
         assert job.region is not None
-        spec, globe = job.region, job.globe
-        key = RegionScene.key(spec, globe)
+        spec, globe, grain = job.region, job.globe, skin_grain(job)
+        key = RegionScene.key(spec, globe, grain)
         surroundings = self._regions.pop(key, None)
         if surroundings is None:
             full, back = len(self._regions) >= _REGIONS, key in self._replaced
             sides = {k for k in self._regions if k[0].seed == spec.seed and k[1] != globe.mirrored}
-            oldest = next((k for k, kept in self._regions.items() if kept.takes(spec, globe) and k not in sides), None)
+            oldest = next(
+                (k for k, kept in self._regions.items() if kept.takes(spec, globe, grain) and k not in sides), None
+            )
             if oldest is None or (back and not full):
                 if full:
                     self._regions.pop(next(iter(self._regions)))
                 forget()
-                surroundings = (RegionScene if spec.head is None else HeadScene)(spec, globe, known)
+                surroundings = (RegionScene if spec.head is None else HeadScene)(spec, globe, known, grain)
             else:
                 surroundings = self._regions.pop(oldest)
                 self._replaced.append(oldest)

@@ -11,7 +11,7 @@ _ROUGH_OIL, _THINNER = 0.13, 0.35  # roughness of a film of oil at a gloss of 0.
 # roughness grows by `_BARER` per gloss below that of standing water.
 _ROUGH_WET, _STANDING, _BARER, _ROUGHEST = 0.02, 0.97, 3.2, 0.15
 _WATER = 0.92  # gloss of tears without oil; with gloss 1, they mirror as much as a layer of oil (index 1.48)
-_RIPPLE_MM, _GLOBE_MM, _ROUGH_RIPPLES = 1.3, 12.0, 0.012  # of a rippled film: waves, the globe's radius, roughness
+_RIPPLE_MM, _GLOBE_MM, _ROUGH_RIPPLES = 1.9, 12.0, 0.012  # of a rippled film: waves, the globe's radius, roughness
 _CALM_MM = (5.6, 7.2)  # distance from the optic axis over which the smooth film of the cornea gets its ripples
 _RIPPLES = ((0.05, 0.3), (0.015, 1.0))  # slopes of wet tissue, and waves to those 1 mm long on the globe
 

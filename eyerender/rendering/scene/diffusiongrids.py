@@ -19,9 +19,14 @@ GRID_ROWS, GRID_COLUMNS = 160, 768  # size of the finer grid over the sheet of s
 SIDE = 192  # size of the grid over the front of the globe
 WIDTH = 2.5  # width of this grid in units of the globe's radius, in Lambert's equal-area projection
 _REDUCTIONS = 2  # reductions of the skin's grid by 2 each, with separate marks of their cells
-_FINE_PX_PER_MM = 11.0  # in images with fewer pixels per mm, every second row and column of the skin's grid suffices
+_FINE_PX_PER_MM = 11.0  # in images with fewer pixels per mm, every second row and column of the skin suffices
 _SPARE, _SPARE_MM = 24.0, 10.0  # reach outside the window from which light arrives: in units of d, and at least
 _EDGE_MM = 0.4  # distance from the lid margins within which the globe may be visible
+
+
+def skin_grain(job: RenderJob) -> int:
+    """Return how many rows and columns of the skin's finest grid and map one of this job stands for, 1 or 2."""
+    return 1 if float(job.camera.scale_at(job.t)) > _FINE_PX_PER_MM else 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +65,7 @@ class SheetCells:
     @classmethod
     def of(cls, posed: RegionMesh, job: RenderJob, spare_mm: float, spare_px: int) -> SheetCells:
         """Select the cells shown in the window, or so close that their light reaches it."""
-        each = 1 if float(job.camera.scale_at(job.t)) > _FINE_PX_PER_MM else 2
+        each = skin_grain(job)
         rows, columns = GRID_ROWS // each, GRID_COLUMNS // each
         texels = SHEET_ROWS // rows
         edges = sheet_place(np.arange(rows + 1.0) * texels - 0.5)

@@ -30,8 +30,8 @@ class HeadScene(RegionScene):
 
     fixed = True
 
-    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
-        super().__init__(spec, globe, known)
+    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None, grain: int = 1) -> None:
+        super().__init__(spec, globe, known, grain)
         self._refuse_crossing(spec, globe)
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
@@ -50,8 +50,7 @@ class HeadScene(RegionScene):
             self._still = placed(load_head(head), globe, texture_rows(head))
         return self._still
 
-    @staticmethod
-    def _look(spec: Region) -> NDArray[np.float16]:
+    def _look(self, spec: Region) -> NDArray[np.float16]:
         return head_map(spec, load_head(_head(spec))).astype(np.float16)
 
     def _inner(self) -> None:

@@ -23,7 +23,7 @@ from ...region.head import file_states
 from ...region.lids import FINE, ROWS
 from ...region.mapcache import kept
 from ...region.mesh import HAIRS, RegionLayout, RegionMesh, region_mesh, sheet_ends
-from ...region.skin import SHEET_ROWS, sheet_v, skin_texels
+from ...region.skin import BANDS, SHEET_ROWS, coarse_skin_texels, sheet_v, skin_texels
 from ..records.frame import aligned_copy
 from .background import clear_between
 from .diffusiongrids import GRID_COLUMNS, GRID_ROWS
@@ -42,12 +42,14 @@ class RegionScene:
         sheet_faces: number of triangles of the sheet of skin.
         posed: the mesh in its pose.
         subject: identity of the subject it was made for.
+        grain: that of its map (`skin.skin_map`).
     """
 
     obstructed = True
     fixed = False  # whether the mesh keeps still, and has no menisci that light passes through
 
-    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> None:
+    def __init__(self, spec: Region, globe: Globe, known: RegionMesh | None = None, grain: int = 1) -> None:
+        self.grain = grain
         posed = known or self._posed(spec, globe)
         meshes = {name: _mesh(posed, *cut) for name, cut in self._cuts(posed.layout).items()}
         parts = {name: {"solid": mesh} if self.fixed else _instance(mesh) for name, mesh in meshes.items()}
@@ -91,7 +93,7 @@ class RegionScene:
         self._records[:, 3], self._records[:, 7] = posed.layout.uv.T
         self._pose_skin(posed)
         self._shown: tuple[Region, Globe] | None = (spec, globe)
-        self.subject = self.key(spec, globe)
+        self.subject = self.key(spec, globe, self.grain)
 
     def _range(self, name: str) -> tuple[mi.UInt32, mi.UInt32] | None:
         """Return the triangles of a part on the device, from the first one to the first one behind."""
@@ -110,11 +112,11 @@ class RegionScene:
         """End of each part's triangles."""
         return self.posed.layout.face_ends
 
-    def takes(self, spec: Region, globe: Globe) -> bool:
+    def takes(self, spec: Region, globe: Globe, grain: int) -> bool:
         """Return whether a subject fits the meshes of the scene."""
         ends, own = self.posed.layout.vertex_ends, [(len(b.vertices), len(b.faces)) for b in globe.frames]
         fits = np.array_equal([ends[-2] - ends[HAIRS], self.body_faces], np.sum([(0, 0), *own], axis=0))
-        return not self.fixed and spec.head is None and fits
+        return not self.fixed and spec.head is None and fits and grain == self.grain
 
     @property
     def body_faces(self) -> int:
@@ -130,11 +132,11 @@ class RegionScene:
         self._dress(spec, globe, posed)
 
     @staticmethod
-    def key(spec: Region, globe: Globe) -> tuple[Any, ...]:
+    def key(spec: Region, globe: Globe, grain: int) -> tuple[Any, ...]:
         """Return the cache key of a scene: the subject, the side, and the state of a head mesh's files."""
         files = () if spec.head is None else file_states(spec.head)
         worn = tuple((b.part, len(b.vertices), b.albedo, hash(b.faces.tobytes())) for b in globe.frames)
-        return spec.with_lids(), globe.mirrored, files, worn
+        return spec.with_lids(), globe.mirrored, files, worn, grain
 
     def show(self, spec: Region, globe: Globe, known: RegionMesh | None = None) -> RegionMesh:
         """Pose lids and lashes, including a blink; the mesh of the pose may already be computed."""
@@ -171,9 +173,8 @@ class RegionScene:
     def _posed(self, spec: Region, globe: Globe) -> RegionMesh:
         return region_mesh(spec, globe)
 
-    @staticmethod
-    def _look(spec: Region) -> NDArray[np.float16]:
-        return kept(skin_texels, spec.with_lids())
+    def _look(self, spec: Region) -> NDArray[np.float16]:
+        return kept(skin_texels if self.grain == 1 else coarse_skin_texels, spec.with_lids())
 
     def _inner(self) -> Bools | None:
         """Mark triangles of the sheet of skin away from its ends; None if it may not be a single surface."""
@@ -186,7 +187,7 @@ class RegionScene:
 
 def _mean_slopes(pixels: NDArray[np.float16]) -> dict[int, mi.Float]:
     """Average the slopes of a map over the cells of the two diffusion grids, by number of rows."""
-    slopes = pixels[:SHEET_ROWS, :, 1:3]
+    slopes = pixels[: len(pixels) * SHEET_ROWS // (SHEET_ROWS + BANDS), :, 1:3]
     down, across = len(slopes) // GRID_ROWS, slopes.shape[1] // GRID_COLUMNS
     parts = [slopes[i::down, j::across].astype(np.float32) for i in range(down) for j in range(across)]
     fine: Singles = np.asarray(sum(parts) / len(parts), dtype=np.float32)

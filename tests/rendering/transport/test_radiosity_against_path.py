@@ -96,7 +96,7 @@ def plain(renderer, monkeypatch):
         look[..., 1:] = 0
         return look
 
-    monkeypatch.setattr(RegionScene, "_look", staticmethod(even))
+    monkeypatch.setattr(RegionScene, "_look", lambda _, spec: even(spec))
     monkeypatch.setattr(lighting, "sheen", lambda *_: mi.Float(0))
     return Renderer(renderer.backend)
 
