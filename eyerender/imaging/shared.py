@@ -21,34 +21,40 @@ if TYPE_CHECKING:
     from ..rig.camera import Window
 
 LIDS_PX = 0.5
-"""Largest motion of lids between poses that moments share: that between moments; each takes the nearer one."""
+"""Largest motion of lids between meshes that moments share: that between moments; each takes the nearer one."""
+_POSED_PX = 2.0  # largest motion of lids between poses, which are joined by straight lines
 _STILL_PX = 0.25  # motion from the middle of an exposure: as far as each moment may be from the truth
 _REACH_MM = 14.0  # from the globe's centre: no part of an eye is farther
 _AROUND_MM = 30.0  # places beside the eye, where a view that moves is noticed
 
 
 def share_lids(jobs: Sequence[RenderJob]) -> tuple[RenderJob, ...]:
-    """Give jobs in the order of time, of one eye and camera, the mesh of the lids of the nearest key pose.
+    """Give jobs in the order of time, of one eye and camera, the nearest of few meshes of the lids.
 
-    Key poses are the first and the last one, and more between them until no vertex moves by more than `LIDS_PX` from
-    one to the next.
+    Lids are posed at the first and the last moment, and at more between them until no vertex moves by more than
+    `_POSED_PX` from one to the next. The meshes between two poses lie evenly on straight lines.
     """
     first = jobs[0]
     if first.region is None or first.region.head is not None or first.eye.worn:
         return tuple(jobs)
-    meshes = {k: _mesh(jobs[k]) for k in (0, len(jobs) - 1)}
-    places = {k: _pixels(first, mesh) for k, mesh in meshes.items()}
-    spans = [(0, len(jobs) - 1)]
+    posed = {k: _mesh(jobs[k]) for k in (0, len(jobs) - 1)}
+    places = {k: _pixels(first, mesh) for k, mesh in posed.items()}
+    meshes, spans = dict(posed), [(0, len(jobs) - 1)]
     while spans:
         low, high = spans.pop()
-        if high - low > 1 and _apart_px(places[low], places[high]).max() > LIDS_PX:
+        apart_px = _apart_px(places[low], places[high]).max()
+        if high - low > 1 and apart_px > _POSED_PX:
             middle = (low + high) // 2
-            meshes[middle] = _mesh(jobs[middle])
-            places[middle] = _pixels(first, meshes[middle])
+            posed[middle] = meshes[middle] = _mesh(jobs[middle])
+            places[middle] = _pixels(first, posed[middle])
             spans += [(low, middle), (middle, high)]
-    keys = np.array(sorted(meshes))
-    nearest = keys[np.abs(np.arange(len(jobs))[:, None] - keys).argmin(axis=1)].tolist()
-    return tuple(replace(job, region=jobs[k].region, posed=meshes[k]) for job, k in zip(jobs, nearest, strict=True))
+            continue
+        steps = max(int(np.ceil(apart_px / LIDS_PX)), 1)
+        step = {k: round(steps * (k - low) / (high - low)) for k in range(low + 1, high)}
+        between = {n: posed[low].towards(posed[high], n / steps) for n in {*step.values()} - {0, steps}}
+        between |= {0: posed[low], steps: posed[high]}
+        meshes |= {k: between[n] for k, n in step.items()}
+    return tuple(replace(job, posed=meshes[k]) for k, job in enumerate(jobs))
 
 
 def moving_part(jobs: Sequence[RenderJob]) -> Window | None:
