@@ -86,7 +86,9 @@ def _in_sequence(
     rows = np.arange(middle.window[3]) + middle.window[1]
     edges, on = timing.segments(int(rows[0]), int(rows[-1]), lights)
     counts = [_steps_of(frames, row, middle, start + low, start + high) for low, high in pairwise(edges)]
-    moves = sum(counts) > len(counts) or _steps_of(frames, row, middle, start + edges[0], start + edges[-1]) > 1
+    moves = sum(counts) > len(counts) or (
+        len(counts) > 1 and _steps_of(frames, row, middle, start + edges[0], start + edges[-1]) > 1
+    )
     if not moves and on.all():
         return ()
     inner = [np.linspace(*pair, count + 1) for pair, count in zip(pairwise(edges), counts, strict=True)]

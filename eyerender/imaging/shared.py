@@ -20,35 +20,41 @@ if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob
     from ..rig.camera import Window
 
-LIDS_PX = 0.25
-"""Largest motion of lids between poses that moments share: half of that between moments; each takes the nearer one."""
-_STILL_PX = 0.25  # motion in the whole exposure: as far as each moment may be from the truth
+LIDS_PX = 0.5
+"""Largest motion of lids between meshes that moments share: that between moments; each takes the nearer one."""
+_POSED_PX = 2.0  # largest motion of lids between poses, which are joined by straight lines
+_STILL_PX = 0.25  # motion from the middle of an exposure: as far as each moment may be from the truth
 _REACH_MM = 14.0  # from the globe's centre: no part of an eye is farther
 _AROUND_MM = 30.0  # places beside the eye, where a view that moves is noticed
 
 
 def share_lids(jobs: Sequence[RenderJob]) -> tuple[RenderJob, ...]:
-    """Give jobs in the order of time, of one eye and camera, the mesh of the lids of the nearest key pose.
+    """Give jobs in the order of time, of one eye and camera, the nearest of few meshes of the lids.
 
-    Key poses are the first and the last one, and more between them until no vertex moves by more than `LIDS_PX` from
-    one to the next.
+    Lids are posed at the first and the last moment, and at more between them until no vertex moves by more than
+    `_POSED_PX` from one to the next. The meshes between two poses lie evenly on straight lines.
     """
     first = jobs[0]
     if first.region is None or first.region.head is not None or first.eye.worn:
         return tuple(jobs)
-    meshes: dict[int, RegionMesh] = {}
-    for k in (0, len(jobs) - 1):
-        meshes[k] = _mesh(jobs[k])
-    spans = [(0, len(jobs) - 1)]
+    posed = {k: _mesh(jobs[k]) for k in (0, len(jobs) - 1)}
+    places = {k: _pixels(first, mesh) for k, mesh in posed.items()}
+    meshes, spans = dict(posed), [(0, len(jobs) - 1)]
     while spans:
         low, high = spans.pop()
-        if high - low > 1 and _motion_px(jobs[low], meshes[low], meshes[high]).max() > LIDS_PX:
+        apart_px = _apart_px(places[low], places[high]).max()
+        if high - low > 1 and apart_px > _POSED_PX:
             middle = (low + high) // 2
-            meshes[middle] = _mesh(jobs[middle])
+            posed[middle] = meshes[middle] = _mesh(jobs[middle])
+            places[middle] = _pixels(first, posed[middle])
             spans += [(low, middle), (middle, high)]
-    keys = np.array(sorted(meshes))
-    nearest = keys[np.abs(np.arange(len(jobs))[:, None] - keys).argmin(axis=1)].tolist()
-    return tuple(replace(job, region=jobs[k].region, posed=meshes[k]) for job, k in zip(jobs, nearest, strict=True))
+            continue
+        steps = max(int(np.ceil(apart_px / LIDS_PX)), 1)
+        step = {k: round(steps * (k - low) / (high - low)) for k in range(low + 1, high)}
+        between = {n: posed[low].towards(posed[high], n / steps) for n in {*step.values()} - {0, steps}}
+        between |= {0: posed[low], steps: posed[high]}
+        meshes |= {k: between[n] for k, n in step.items()}
+    return tuple(replace(job, posed=meshes[k]) for k, job in enumerate(jobs))
 
 
 def moving_part(jobs: Sequence[RenderJob]) -> Window | None:
@@ -65,7 +71,9 @@ def moving_part(jobs: Sequence[RenderJob]) -> Window | None:
         pixels, front = first.camera.project(np.concatenate(shown))
     else:
         meshes = list({id(job.posed): job.posed for job in jobs if job.posed is not None}.values())
-        moved = np.max([_motion_px(first, meshes[0], mesh) for mesh in meshes], axis=0) > _STILL_PX
+        places = [_pixels(first, mesh) for mesh in meshes]
+        middle = places[len(places) // 2]
+        moved = np.max([_apart_px(middle, other) for other in places], axis=0) > _STILL_PX
         shown = [np.concatenate([m.upper_margin, m.lower_margin, m.vertices[moved]]) for m in meshes]
         pixels, front = first.camera.project(np.concatenate(shown) + first.anchor_mm)
     if not front.all():
@@ -79,10 +87,14 @@ def _mesh(job: RenderJob) -> RegionMesh:
     return region_mesh(job.region, job.globe)
 
 
-def _motion_px(job: RenderJob, a: RegionMesh, b: RegionMesh) -> Floats:
-    """Return how far (n,) the vertices of two meshes are apart in a job's picture."""
-    first, second = (job.camera.project(mesh.vertices + job.anchor_mm)[0] for mesh in (a, b))
-    return np.asarray(np.nan_to_num(np.abs(first - second), nan=np.inf).max(axis=1))
+def _pixels(job: RenderJob, mesh: RegionMesh) -> Floats:
+    """Return where the vertices (n, 2) of a mesh are in a job's picture."""
+    return job.camera.project(mesh.vertices + job.anchor_mm)[0]
+
+
+def _apart_px(a: Floats, b: Floats) -> Floats:
+    """Return how far (n,) places in a picture are apart."""
+    return np.asarray(np.nan_to_num(np.abs(a - b), nan=np.inf).max(axis=1))
 
 
 def _view_moves(jobs: Sequence[RenderJob]) -> bool:

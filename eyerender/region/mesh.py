@@ -74,6 +74,23 @@ class RegionMesh(ArrayValue):
     strands: tuple[Floats, ...]
     radii: tuple[Floats, ...]
 
+    def towards(self, other: RegionMesh, share: float) -> RegionMesh:
+        """Return the mesh a share of the way to that of another pose of the same subject, along straight lines."""
+
+        def between(a: Floats, b: Floats) -> Floats:
+            return sealed(a + share * (b - a))
+
+        return RegionMesh(
+            vertices=between(self.vertices, other.vertices),
+            normals=between(self.normals, other.normals),
+            layout=self.layout,
+            upper_margin=between(self.upper_margin, other.upper_margin),
+            lower_margin=between(self.lower_margin, other.lower_margin),
+            border=between(self.border, other.border),
+            strands=tuple(map(between, self.strands, other.strands)),
+            radii=tuple(map(between, self.radii, other.radii)),
+        )
+
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Singles, frozen
+from ..base.arrays import Bools, Floats, Ints, Singles, frozen
 from ..rig.camera import Window
 from .glints.splatting import MirrorImages, Shine
 from .integrator.film import Means, coarse_sensor, mean_radiance, start
@@ -19,7 +19,6 @@ from .integrator.lensmirror import mirrored_surroundings
 from .output.geometry import Hits, window_hits
 from .output.labels import PartLabels, annotated_parts, highlights, part_labels
 from .output.window import Exposed, RawFrame, RenderedWindow
-from .records.frame import DeviceFrame
 from .records.job import RenderJob, SubFrames
 from .records.recording import uncollected
 from .scene.background import Background
@@ -96,14 +95,14 @@ class Renderer:
         in_lenses: dict[int, list[Singles]] = {id(part): [] for part in parts}
         failed = 0
         marks: tuple[Any, ...] | None = None
-        rows: list[tuple[Bools, PartLabels]] = []
+        rows: list[tuple[Ints, int, PartLabels]] = []
         around: Callable[[], Singles] | None = None
-        lit: dict[tuple[float, ...], DeviceFrame] = {}  # a frame for each state of the lamps
+        lit: dict[tuple[float, ...], BoundFrame] = {}  # the last frame under each state of the lamps
         images: MirrorImages | None = None
         for shot, part in shots:
             lamps = _lamps(shot)
             bound, surroundings = self._builder.set(shot, after=None if moments else after, before=lit.get(lamps))
-            lit.setdefault(lamps, bound.frame)
+            lit[lamps] = bound
             blur = blur or (Blur.of(job, surroundings.posed) if moments else bound.host.blur)
             means = film.start(bound, blur, part)
             mirror = mirrored_surroundings(bound, blur.window, film.each, shot.seed)
@@ -111,7 +110,8 @@ class Renderer:
                 around = coarse_sensor(bound)
             # The device works until something is read, so host work comes first.
             found = _marks(bound, job, surroundings) if _is_middle(shot, job) else None
-            own = None if part.labelled is None else part_labels(bound, job.window)
+            there = _inside(job.window, None, part.labelled)
+            own = None if part.labelled is None else part_labels(bound, there)
             self._builder.prepare()
             images = self._mirror_images(bound.host, images)
             mirrored, shines = images.seen(surroundings, blur, 1 / len(part.jobs))
@@ -124,7 +124,7 @@ class Renderer:
             if found is not None:
                 marks = mirrored, *found()
             if own is not None and part.labelled is not None:
-                rows.append((part.labelled, own()))
+                rows.append((np.flatnonzero(part.labelled), there[1] - job.window[1], own()))
         assert blur is not None
         if marks is None:  # no sub-frame is at mid-exposure
             bound, surroundings = self.bind(job, lit=False)
@@ -212,7 +212,7 @@ class _Film:
         return read
 
 
-def _inside(window: Window, part: Window | None, rows: Floats | None = None) -> Window:
+def _inside(window: Window, part: Window | None, rows: Floats | Bools | None = None) -> Window:
     """Return a part of a window, in those of its rows that get light; all of it without a part.
 
     Its sizes are multiples of `_SIZES`, because each size has recordings of its own. `rows` are those of the window
@@ -242,13 +242,13 @@ def _is_middle(shot: RenderJob, job: RenderJob) -> bool:
     return all(getattr(shot, name) is getattr(job, name) for name in ("M", "t", "camera", "region", "eye"))
 
 
-def _by_rows(labels: PartLabels | None, rows: Sequence[tuple[Bools, PartLabels]]) -> PartLabels | None:
-    """Put raster labels together whose rows are exposed at different times."""
+def _by_rows(labels: PartLabels | None, rows: Sequence[tuple[Ints, int, PartLabels]]) -> PartLabels | None:
+    """Put raster labels together whose rows are exposed at different times: which rows, and where the labels begin."""
     if labels is None or not rows:
         return labels
     part, amodal = np.array(labels.part), np.array(labels.amodal)
-    for inside, own in rows:
-        part[inside], amodal[inside] = own.part[inside], own.amodal[inside]
+    for which, first, own in rows:
+        part[which], amodal[which] = own.part[which - first], own.amodal[which - first]
     return replace(labels, part=frozen(part, part.dtype), amodal=frozen(amodal, amodal.dtype))
 
 

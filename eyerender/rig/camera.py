@@ -647,7 +647,7 @@ class PinholeCamera(ArrayValue):
     @property
     def fold(self) -> tuple[float, float]:
         """Radius beyond which a radial distortion images nothing, without and with it; inf if it images everything."""
-        return fold_radius(self.distortion, self.reach)
+        return fold_radius(tuple(self.distortion.tolist()), self.reach)
 
     def without_rays(self, window: Window) -> Bools | None:
         """Return which pixels (h, w) of a window lie beyond the fold of the lens; None if none does."""

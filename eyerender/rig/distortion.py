@@ -190,7 +190,8 @@ def undistort(xd: Floats, yd: Floats, k: Floats, iterations: int = 50) -> tuple[
     return np.where(bad, np.nan, x), np.where(bad, np.nan, y)
 
 
-def fold_radius(k: Floats, most: float = np.inf) -> tuple[float, float]:
+@lru_cache(maxsize=16)  # a camera has the same in every frame
+def fold_radius(k: tuple[float, ...], most: float = np.inf) -> tuple[float, float]:
     """Compute the radius beyond which the radial part of a lens images nothing, without and with distortion.
 
     There r g(r^2) has its first maximum or pole; inf if it has none. A lens ends at the radius `most` at the latest,
@@ -212,7 +213,7 @@ def fold_radius(k: Floats, most: float = np.inf) -> tuple[float, float]:
         return reach, abs(reach * float(n(reach**2) / m(reach**2)))
 
 
-@lru_cache(maxsize=16)  # a camera has the same in every frame
+@lru_cache(maxsize=16)
 def ray_polynomials(k: tuple[float, ...], corner: float) -> tuple[float, ...]:
     """Fit the rays of a fisheye: sin(theta) / theta_d, cos(theta) and d theta / d theta_d over theta_d^2.
 
@@ -220,7 +221,7 @@ def ray_polynomials(k: tuple[float, ...], corner: float) -> tuple[float, ...]:
         The coefficients (3 x `POLYNOMIAL`,), the constant ones first, and the largest theta_d^2: that of `corner`, the
         farthest radius of the sensor, or of the fold. Nothing if single precision would miss the functions by 1e-6.
     """
-    t = fold_radius(np.array(k))[0] * np.sin(np.linspace(1e-6, np.pi / 2, 2000))
+    t = fold_radius(k)[0] * np.sin(np.linspace(1e-6, np.pi / 2, 2000))
     growth = sum((1.0, *k[:4])[n] * t ** (2 * n) for n in range(5))
     inside = t * growth <= corner
     t, radius = t[inside], (t * growth)[inside]

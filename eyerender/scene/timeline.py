@@ -323,9 +323,10 @@ def stops_of(scene: TimedScene, index: Index) -> Stop | None:
     if scene.spec.sequence is None:
         return None
     size, shift = np.asarray(index.stop_mm), np.asarray(index.stop_shift_mm)
-    keys, back = np.unique(np.column_stack([index.eye, np.nan_to_num(size)]), axis=0, return_inverse=True)
-    found = stack_stops([_stop(scene, EYES[int(eye)], float(mm)) for eye, mm in keys])
-    rows: Indices = back.reshape(-1)
+    keys = list(zip(index.eye.tolist(), np.nan_to_num(size).tolist(), strict=True))
+    places = {key: k for k, key in enumerate(dict.fromkeys(keys))}
+    found = stack_stops([_stop(scene, EYES[eye], mm) for eye, mm in places])
+    rows: Indices = np.array([places[key] for key in keys], dtype=np.int64)
     moved = np.concatenate([np.zeros((len(rows), 1)), np.nan_to_num(shift)], axis=1)
     stops = take_stops(found, rows)
     return replace(stops, centre_mm=stops.centre_mm + moved)

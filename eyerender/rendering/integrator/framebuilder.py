@@ -9,6 +9,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...base.arrays import Cache
 from ...region.mesh import RegionMesh, region_mesh
@@ -37,6 +38,7 @@ from .hostdata import BoundFrame, HostData
 _REGIONS, _TEXTURES = 4, 8  # cached
 _SUBJECTS = 32  # then recordings are forgotten, because those of sizes that never come back take 3 MB each
 _FEWEST_PX = 40.0  # across the iris; in smaller images there are fewer samples than nodes of its grid
+_SAME_LIGHT_RAD = np.radians(1.0)  # turn of an eye under its lamps that hardly changes the light behind its cornea
 _FARTHEST_MM = 60.0  # half the largest width of the grid over the background's plane
 
 
@@ -62,6 +64,14 @@ def _grids_behind_cornea(
     pupil = FundusIrradiance.build(frame, factors)
     on_iris = None if lamps is None else IrisIrradiance.build(frame, lamps, points[0])
     return on_iris, IrisRelief.build(frame, shape, side, points[1], relief), pupil
+
+
+def _is_lit_alike(host: HostData, other: HostData) -> bool:
+    """Return whether an eye has the same pupil at two moments, and nearly the same directions of lamps and camera."""
+    if host.job.eye is not other.job.eye:
+        return False
+    moved = np.linalg.norm(host.around_mm - other.around_mm, axis=1)
+    return bool(np.all(moved <= _SAME_LIGHT_RAD * np.linalg.norm(other.around_mm, axis=1)))
 
 
 class FrameBuilder:
@@ -107,12 +117,13 @@ class FrameBuilder:
         *,
         lit: bool = True,
         after: RenderJob | None = None,
-        before: DeviceFrame | None = None,
+        before: BoundFrame | None = None,
     ) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye; both are valid until the next call.
 
         `lit`: whether to compute light, not only geometry; `after`: the job of the next frame, if known; `before`: a
-        frame a moment ago under the same lamps, whose light from surface to surface is taken over.
+        frame a moment ago under the same lamps, whose light from surface to surface is taken over, and that behind the
+        cornea until the eye has turned notably.
         """
         host, surroundings = self._host_data(job)
         region = surroundings if isinstance(surroundings, RegionScene) else None
@@ -121,7 +132,7 @@ class FrameBuilder:
         # Large kernels that need few inputs are launched first, so that the device is busy while NumPy prepares the
         # rest.
         shadow_maps = (
-            before.caches.shadow_maps
+            before.frame.caches.shadow_maps
             if before is not None
             else None
             if region is None
@@ -150,7 +161,7 @@ class FrameBuilder:
             frame.surfaces = meshed(frame.surfaces, self.meshes.of(job.eye, job.mesh_edge_mm))
         if lit and structure.scattering and region is not None:
             frame.caches.diffusion = (
-                before.caches.diffusion
+                before.frame.caches.diffusion
                 if before is not None
                 else DiffusedLight.build(frame, job, host.lamps, region, host.tissue_cells)
             )
@@ -158,13 +169,19 @@ class FrameBuilder:
             even = job.ambient.irradiance_w_m2 * 1e-3
             panels = panel_table(job.ambient, job.anchor_mm)
             frame.caches.ambience = Ambience.build(even, panels, job.ambient.map, self._maps)
+        lit_at: HostData | None = None
         if lit and before is not None:
-            self._fill_grids(host, frame, surroundings)
-            frame.caches.radiosity = before.caches.radiosity
+            caches, lit_at = before.frame.caches, before.lit_at or before.host
+            if _is_lit_alike(host, lit_at):
+                frame.caches.iris, frame.caches.relief, frame.caches.fundus = caches.iris, caches.relief, caches.fundus
+            else:
+                self._fill_grids(host, frame, surroundings)
+                lit_at = None
+            frame.caches.radiosity = caches.radiosity
             self._fill_globe(host, frame, surroundings)
         elif lit:
             self._light(host, frame, surroundings, after)
-        return BoundFrame(frame, host), surroundings
+        return BoundFrame(frame, host, lit_at), surroundings
 
     def _light(
         self, host: HostData, frame: DeviceFrame, surroundings: Background | RegionScene, after: RenderJob | None

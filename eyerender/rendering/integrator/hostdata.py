@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import Bools, Singles
+from ...base.arrays import Bools, Floats, Singles
 from ...eye.fundus import FundusLight
 from ...region.mesh import RegionMesh
 from ...rig.camera import Window
@@ -67,6 +67,12 @@ class HostData:
         """Lamps and sun in the eye frame."""
         job, lights = self.job, self.sunlit.lights
         return LampTable.of(lights, job.M, job.t, len(lights) - len(job.lights))
+
+    @cached_property
+    def around_mm(self) -> Floats:
+        """Positions of lamps, sun and camera in the eye frame, (n, 3) mm."""
+        job = self.job
+        return np.concatenate([self.lamps.rows[:, :3], [(job.camera.nodal_point_mm - job.t) @ job.M]])
 
     @cached_property
     def lit_through(self) -> Bools:
@@ -152,7 +158,14 @@ class HostData:
 
 @dataclass(frozen=True, slots=True)
 class BoundFrame:
-    """A frame on the device, ready to be rendered, and the host data of its job."""
+    """A frame on the device, ready to be rendered.
+
+    Attributes:
+        frame: the frame.
+        host: the host data of its job.
+        lit_at: the host data at whose pose the light behind the cornea was computed; None: at that of `host`.
+    """
 
     frame: DeviceFrame
     host: HostData
+    lit_at: HostData | None = None

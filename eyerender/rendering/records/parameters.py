@@ -9,7 +9,8 @@ Nothing here depends on Mitsuba.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -176,8 +177,8 @@ def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
     """Rebuild a tree of parameters; `leaf(size)` returns each leaf, in the order of `packed`."""
     node: Any = tree
     made: Any
-    if is_dataclass(node):
-        made = replace(node, **{f.name: rebuilt(getattr(node, f.name), leaf) for f in fields(node)})  # type: ignore[type-var]
+    if names := names_of(type(node)):
+        made = type(node)(**{name: rebuilt(getattr(node, name), leaf) for name in names})
     elif _is_branch(node):
         made = tuple(rebuilt(part, leaf) for part in node)
     else:
@@ -186,9 +187,9 @@ def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
 
 
 def _leaves(node: Any) -> Iterator[Any]:
-    if is_dataclass(node):
-        for f in fields(node):
-            yield from _leaves(getattr(node, f.name))
+    if names := names_of(type(node)):
+        for name in names:
+            yield from _leaves(getattr(node, name))
     elif _is_branch(node):
         for part in node:
             yield from _leaves(part)
@@ -198,4 +199,10 @@ def _leaves(node: Any) -> Iterator[Any]:
 
 def _is_branch(node: Any) -> bool:
     """Return whether a tuple holds parameters or vectors; a tuple of plain numbers is a leaf."""
-    return isinstance(node, tuple) and any(is_dataclass(part) or np.ndim(part) for part in node)
+    return isinstance(node, tuple) and any(names_of(type(part)) or np.ndim(part) for part in node)
+
+
+@cache
+def names_of(kind: type) -> tuple[str, ...]:
+    """Return the attribute names of a dataclass; none of another class."""
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()

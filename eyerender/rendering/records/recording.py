@@ -5,11 +5,12 @@ from __future__ import annotations
 import gc
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
-from functools import cache, wraps
+from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import drjit as dr
+
+from .parameters import names_of
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -80,17 +81,11 @@ def _collect(value: Any, plain: list[Any]) -> None:
         for item in value.values():
             _collect(item, plain)
     else:
-        for name in _names(kind):  # type: ignore[arg-type]  # classes are hashable
+        for name in names_of(kind):  # type: ignore[arg-type]  # classes are hashable
             _collect(getattr(value, name), plain)
 
 
 _PLAIN = {type(None), bool, int, float, str}
-
-
-@cache
-def _names(kind: type) -> tuple[str, ...]:
-    """Return the attribute names of a class that Dr.Jit traverses."""
-    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 
 def forget() -> None:
