@@ -16,7 +16,7 @@ ROOT = HERE.parent
 sys.path.insert(0, str(ROOT))
 
 import eyerender  # noqa: E402
-from docs.tools import keys, references, validation  # noqa: E402
+from docs.tools import keys, origins, references, validation  # noqa: E402
 
 project = "eyerender"
 author = copyright = "eyerender contributors"
@@ -81,9 +81,15 @@ def display_math(translator: Any, node: Any) -> None:
     raise nodes.SkipNode
 
 
+def mark_origins(app: Sphinx, page: str, source: list[str]) -> None:
+    """Say below a heading where its figures come from."""
+    source[0] = origins.mark(page, source[0])
+
+
 def setup(app: Sphinx) -> None:
-    """Register the writer of equations."""
+    """Register the writer of equations, and the lines on the origin of figures."""
     app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
+    app.connect("source-read", mark_origins)
 
 
 # Links to GitHub and to journals change without our doing; `scripts/docs --check-links` lists those that do not answer.
