@@ -49,14 +49,15 @@ def measured(text: str) -> tuple[datetime.date, str] | None:
 
 def mark(page: str, text: str) -> str:
     """Add a line below each heading whose figures were measured once, or are compared in each run of the tests."""
-    rows = load().get(page, {})
-    for title, where in rows.items():
+    for title, where in load().get(page, {}).items():
         done = measured(where)
-        if done is None and not where.startswith("tests/"):
-            continue
-        by = "compared with the product in each run of <code>" + where + "</code>"
         if done is not None:
             by = f"of {done[0]}" + (f", by <code>{done[1]}</code>" if done[1] else "")
-        head = rf"^#{{1,4}} {re.escape(title)}$" if title else r"^# .*$"
-        text = re.sub(head, lambda m, by=by: f'{m[0]}\n\n<p class="origin">Figures {by}</p>\n', text, count=1, flags=re.M)  # fmt: skip
+        elif where.startswith("tests/"):
+            by = f"compared with the product in each run of <code>{where}</code>"
+        else:
+            continue
+        head = re.search(rf"^#{{1,4}} {re.escape(title)}$" if title else r"^# .*$", text, re.MULTILINE)
+        if head is not None:
+            text = f'{text[: head.end()]}\n\n<p class="origin">Figures {by}</p>\n{text[head.end() :]}'
     return text

@@ -167,7 +167,7 @@ class DatasetSpec(FileSpec):
     def _check(self) -> Self:
         self._check_clips()
         if self.population is not None and self.eye_parameters:
-            raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
+            raise ValueError("eye_parameters: cannot be combined with a population; use its 'replace'")
         for name in self.variables or {}:
             if not (name.isidentifier() and name.isascii()) or name in FUNCTIONS or keyword.iskeyword(name):
                 raise ValueError(f"variables.{name}: a name must be a plain word that is no function")
@@ -175,7 +175,7 @@ class DatasetSpec(FileSpec):
             raise ValueError("labels.geometry: depth and normals are not found behind spectacles so far")
         for key in ("population", "person"):
             if key in self.scene:
-                raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")
+                raise ValueError(f"scene.{key}: write 'population' next to 'scene', not in it")
         self._check_splits()
         return self
 
@@ -246,7 +246,7 @@ class DatasetSpec(FileSpec):
 
     @property
     def selection(self) -> Selection | ClipSelection:
-        """Which samples are made, and in which shards."""
+        """Plan of a dataset: its samples and the shards that hold them."""
         spread, n = self.choice == "spread" and self.count % self.planned_count > 0, self.clip_frames
         found = _selection(
             count=self.count // n,

@@ -170,7 +170,7 @@ def begin_each(
     annotated: bool = False,
     geometry: tuple[str, ...] = (),
 ) -> Iterator[BegunImage]:
-    """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
+    """Trace the rows of many frames in order; a second thread turns each trace into an image meanwhile.
 
     The next frames are fetched before the last ones are traced, so that a second thread can prepare them. If fetching
     fails, the frames at hand are traced first.

@@ -631,7 +631,7 @@ class Scene:
 
     @property
     def frame_count(self) -> int:
-        """How many frames there are, one for each head position, fixation and camera, whether it sees an eye or not."""
+        """Number of frames: one for each head position, fixation and camera, whether it sees an eye or not."""
         if (sequence := self.spec.sequence) is not None:
             return len(self.rig.cameras) * (instants_of(self) if sequence.instants is None else len(sequence.instants))
         fixations = len(self.spec.poses or ()) if self.targets_mm is None else len(self.targets_mm)
