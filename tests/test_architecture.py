@@ -239,12 +239,12 @@ def lines_of(package: str = "") -> int:
 # Most lines (code, stubs, scripts of pages, templates) of each package and of the whole, "". A bound rises only in the
 # commit that brings a capability, with a sentence here that says for whom.
 BOUNDS = {
-    "": 99970,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
+    "": 99985,  # eyes in time: motion, cameras, clips, traces; glasses; people, for makers and trainers
     "analytic": 1160,  # eyes behind spectacles, and the lenses' own reflections, for trackers of people who wear them
     "apps": 19360,  # users' own studies, a rule for each sentence of a paper; two rigs compared, for their makers
     "backends": 970,  # a hook that chooses libLLVM before any import of drjit, for users of mitsuba
     "base": 2660,  # one door for child processes and stored files; arguments checked; bodies of triangles, for all
-    "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
+    "cli": 2695,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
     "dataset": 11780,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 4060,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 6030,
