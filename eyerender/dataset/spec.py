@@ -282,7 +282,7 @@ def _clip_frames(duration_s: Any, rig: Any) -> int:
     cameras = rig.get("cameras") if isinstance(rig, Mapping) else None
     given = [c.get("frame_rate_hz") for c in cameras if isinstance(c, Mapping)] if isinstance(cameras, list) else []
     if any(isinstance(rate, Mapping) for rate in given) or not isinstance(duration_s, int | float):
-        raise ValueError("scene.sequence.duration_s: it, and frame_rate_hz of the cameras, must be plain numbers")
+        raise ValueError("scene.sequence.duration_s: must be a plain number, and so must frame_rate_hz of the cameras")
     rates = {DEFAULT_RATE_HZ if rate is None else rate for rate in given or [None]}
     if len(rates) > 1:
         raise ValueError("scene.rig.cameras: must have one frame_rate_hz in a dataset of sequences")

@@ -92,7 +92,7 @@ class VideoReader:
     Attributes:
         frames_per_s: frame rate that the file states, else 25.
         count: number of frames that the file states, else 0.
-        gaps: first and last number of each run of frames that cannot be read, but for those at the end.
+        gaps: first and last number of each run of frames that cannot be read, except at the end.
         read: number of frames that were read.
 
     Raises:

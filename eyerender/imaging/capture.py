@@ -173,7 +173,7 @@ def begin_each(
     """Trace the rows of many frames in order; a second thread turns each trace into an image meanwhile.
 
     The next frames are fetched before the last ones are traced, so that a second thread can prepare them. If fetching
-    fails, the frames at hand are traced first.
+    fails, the frames fetched so far are traced first.
 
     Args:
         many: the frames, one scene after the other.
