@@ -58,6 +58,7 @@ napoleon_attr_annotations = (
     False  # the docstrings state shapes, and NumPy's types with a final underscore are no references
 )
 default_role = "code"
+smartquotes_action = "qe"  # options such as --json keep their two hyphens
 
 html_theme = "furo"
 html_title = "eyerender"
