@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx import addnodes
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).resolve().parent
@@ -16,7 +19,7 @@ ROOT = HERE.parent
 sys.path.insert(0, str(ROOT))
 
 import eyerender  # noqa: E402
-from docs.tools import keys, references, validation  # noqa: E402
+from docs.tools import keys, origins, references, validation  # noqa: E402
 
 project = "eyerender"
 author = copyright = "eyerender contributors"
@@ -55,12 +58,14 @@ napoleon_attr_annotations = (
     False  # the docstrings state shapes, and NumPy's types with a final underscore are no references
 )
 default_role = "code"
+smartquotes_action = "qe"  # options such as --json keep their two hyphens
 
 html_theme = "furo"
 html_title = "eyerender"
 html_static_path = ["static"]
 html_logo = html_favicon = "static/logo.svg"
 html_css_files = ["site.css"]
+html_js_files = ["unfold.js"]
 html_theme_options = {"navigation_with_keys": True}
 copybutton_prompt_text = "$ "
 
@@ -81,9 +86,35 @@ def display_math(translator: Any, node: Any) -> None:
     raise nodes.SkipNode
 
 
+def mark_origins(app: Sphinx, page: str, source: list[str]) -> None:
+    """Say below a heading where its figures come from."""
+    app.env.note_dependency(str(origins.DATA))
+    source[0] = origins.mark(page, source[0])
+
+
+def link_pages(app: Sphinx, kind: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
+    """Make links of the pages that a docstring names as files."""
+    lines[:] = [re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line) for line in lines]
+
+
+def fold_api(app: Sphinx, doctree: nodes.document, page: str) -> None:
+    """Show the signature and the first paragraph of each public name, and fold the rest."""
+    if not page.startswith("generated/api_"):
+        return
+    for name in doctree.findall(addnodes.desc):
+        content = name.next_node(addnodes.desc_content)
+        if isinstance(name.parent, addnodes.desc_content) or content is None or len(content) < 2:
+            continue
+        content.insert(1, nodes.raw("", "<details><summary>Details</summary>", format="html"))
+        content.append(nodes.raw("", "</details>", format="html"))
+
+
 def setup(app: Sphinx) -> None:
-    """Register the writer of equations."""
+    """Register the writer of equations, the lines on the origin of figures, and the folds of the API."""
     app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
+    app.connect("source-read", mark_origins)
+    app.connect("autodoc-process-docstring", link_pages)
+    app.connect("doctree-resolved", fold_api)
 
 
 # Links to GitHub and to journals change without our doing; `scripts/docs --check-links` lists those that do not answer.
@@ -91,15 +122,21 @@ linkcheck_timeout = 20
 linkcheck_retries = 2
 linkcheck_anchors = False
 
-# The gallery: each example becomes a page and a notebook. EYERENDER_DOCS_EXAMPLES=0 leaves their pictures out.
+# The gallery: each example becomes a page and a notebook. EYERENDER_DOCS_EXAMPLES=0 leaves their pictures
+# out, but for thumbnails that `scripts/tools/make_thumbnails.py` made.
 EXAMPLES = ROOT / "examples"
 if any(EXAMPLES.glob("[0-9]*_*.py")):
     extensions.append("sphinx_gallery.gen_gallery")
+    run_examples = os.environ.get("EYERENDER_DOCS_EXAMPLES", "1") != "0"
+    thumbnails = HERE / "gallery" / "images" / "thumb"
+    thumbnails.mkdir(parents=True, exist_ok=True)
+    for stored in (HERE / "data" / "thumbnails").glob("*.png"):  # replaced where the examples run
+        shutil.copyfile(stored, thumbnails / f"sphx_glr_{stored.stem}_thumb.png")
     sphinx_gallery_conf = {
         "examples_dirs": str(EXAMPLES),
         "gallery_dirs": "gallery",
         "filename_pattern": r"/\d+_\w+\.py$",
-        "plot_gallery": os.environ.get("EYERENDER_DOCS_EXAMPLES", "1") != "0",
+        "plot_gallery": run_examples,
         "within_subsection_order": "FileNameSortKey",
         "remove_config_comments": True,
         "download_all_examples": False,

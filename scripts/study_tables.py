@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Renew the tables of docs/studies.md and docs/studies_people.md.
+"""Renew the tables of the pages on studies, docs/studies*.md.
 
     study_tables.py [FOLDER ...]
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,8 +21,7 @@ from typing import Any
 from eyerender.apps.study import literature as lit
 
 ROOT = Path(__file__).parents[1]
-DATA, PAGE = ROOT / "docs/data/studies/results.json", ROOT / "docs/studies.md"
-PEOPLE_DATA, PEOPLE_PAGE = ROOT / "docs/data/studies/people.json", ROOT / "docs/studies_people.md"
+DATA, PEOPLE_DATA = ROOT / "docs/data/studies/results.json", ROOT / "docs/data/studies/people.json"
 UNTESTED = ROOT / "docs/data/studies/untested_sentences.csv"
 MODELS = lit.MODELS
 READINGS = ("published", "corrected")
@@ -103,7 +101,17 @@ def people_tables(data: Mapping[str, Any]) -> dict[str, str]:
                 body = [[f["id"], f["rule"], "-" if f["value"] is None else f"{f['value']:.3g}", f["threshold"],
                          told[f["verdict"]], f["detail"]] for f in rows]  # fmt: skip
                 out[f"{study} findings"] = table(["id", "statement", "value", "threshold", "verdict", "detail"], body)
+    out["pupil-size short"] = _sizes(data["pupil-size"]["sizes"])
     return out
+
+
+def _sizes(rows: list[dict[str, Any]]) -> str:
+    """Format the 95th percentiles of the exact features, a column per correction."""
+    some = [r for r in rows if (r["observer"], r["stop_mm"]) == ("analytic", 4.0)]
+    by = {(r["camera"], r["correction"]): f"{r['p95']:.1f}" for r in some}
+    corrections = ("none", "cosine", "major axis", "table")
+    cameras = dict.fromkeys(r["camera"] for r in some)
+    return table(["camera", *corrections], [[c, *(by[c, name] for name in corrections)] for c in cameras])
 
 
 def _calibrations(rows: list[dict[str, Any]]) -> str:
@@ -251,15 +259,17 @@ def _untested() -> str:
         return table(["section", "sentence", "why no rule"], [list(row) for row in list(csv.reader(file))[1:]])
 
 
-def page_with(text: str, found: Mapping[str, str]) -> str:
-    """Replace the tables of the page."""
+def pages_with(found: Mapping[str, str]) -> dict[Path, str]:
+    """Return the text of every page on studies with these tables; each table is on one page."""
+    pages = {path: path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("studies*.md"))}
     for name, body in found.items():
-        pattern = rf"(<!-- table {re.escape(name)} -->\n).*?(<!-- end -->)"
-        if not re.search(pattern, text, re.S):
-            raise SystemExit(f"{PAGE}: there is no table {name}")
-        before, after = re.split(pattern, text, maxsplit=1, flags=re.S)[0::3]
-        text = f"{before}<!-- table {name} -->\n{body}\n<!-- end -->{after}"
-    return text
+        places = [path for path, text in pages.items() if f"<!-- table {name} -->\n" in text]
+        if len(places) != 1:
+            raise SystemExit(f"docs: {len(places)} pages have the table {name}")
+        before, rest = pages[places[0]].split(f"<!-- table {name} -->\n")
+        after = rest.partition("<!-- end -->")[2]
+        pages[places[0]] = f"{before}<!-- table {name} -->\n{body}\n<!-- end -->{after}"
+    return pages
 
 
 def main() -> int:
@@ -276,10 +286,9 @@ def main() -> int:
             means = {**old.get("means", {}), **new.get("means", {})}
             data[name] = {**old, **new, **({"means": means} if means else {})}
     DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text(page_with(PAGE.read_text(encoding="utf-8"), tables(data)), encoding="utf-8")
     PEOPLE_DATA.write_text(json.dumps(people, indent=1) + "\n", encoding="utf-8")
-    written = page_with(PEOPLE_PAGE.read_text(encoding="utf-8"), people_tables(people))
-    PEOPLE_PAGE.write_text(written, encoding="utf-8")
+    for path, text in pages_with({**tables(data), **people_tables(people)}).items():
+        path.write_text(text, encoding="utf-8")
     return 0
 
 

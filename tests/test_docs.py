@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import doctest
 import importlib.util
 import json
@@ -20,7 +21,8 @@ import yaml
 from PIL import Image
 
 import eyerender as er
-from docs.tools import keys, references, validation
+from docs.tools import keys, origins, references, validation
+from eyerender.cli.app import app
 from eyerender.scene import Scene
 from eyerender.scene.spec import SceneSpec
 from tests.support.paths import DATA, ROOT
@@ -150,6 +152,48 @@ def test_measurements_are_those_of_tests_that_there_are():
         body = re.split(r"\ndef ", text.partition(f"def {name}(")[2])[0]
         assert row["assertion"] in body, row["what"]
         assert 0 <= row["value"] <= row["limit"]
+
+
+def own_pages() -> dict[str, str]:
+    """The pages that people wrote, with the README."""
+    return {path.stem: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *DOCS.glob("*.md")]}
+
+
+def test_every_figure_of_a_page_has_an_origin():
+    known = origins.load()
+    missing = [
+        f"{name}: {path[-1]}"
+        for name, text in own_pages().items()
+        for path, body in origins.sections(text)
+        if origins.states_figures(body) and origins.origin(known.get(name, {}), path) is None
+    ]
+    assert missing == [], "docs/data/figures.yaml has no origin for these sections"
+
+
+def test_origins_are_of_sections_and_programs_that_there_are():
+    pages = own_pages()
+    for name, rows in origins.load().items():
+        titles = {title for path, _ in origins.sections(pages[name]) for title in path}
+        assert rows.keys() <= {"", *titles}, name
+        for where in rows.values():
+            done = origins.measured(where)
+            command = where if done is None else done[1]
+            assert done is None or done[0] <= datetime.date.today(), f"{name}: {where}"
+            if command.startswith("eyerender "):
+                assert command.split()[1] in app, f"{name}: {where}"
+            elif command and command not in ("defined", "cited"):
+                assert (ROOT / command).exists(), f"{name}: {where}"
+            if done is None and command.startswith("tests/"):
+                assert "README" in (ROOT / command).read_text(encoding="utf-8"), f"{where} reads no page"
+
+
+def test_a_section_takes_its_origin_from_the_one_above():
+    text = "# Page\n## A\n1.5 px\n### B\n| 1 | 2 | 3 |\n## C\nin 3 ways\n"
+    found = {path[-1]: (path, body) for path, body in origins.sections(text)}
+    assert [origins.states_figures(found[title][1]) for title in "ABC"] == [True, True, False]
+    assert origins.origin({"A": "cited"}, found["B"][0]) == "cited"
+    assert origins.origin({"A": "cited"}, found["C"][0]) is None
+    assert origins.measured("2026-11-24 scripts/test") == (datetime.date(2026, 11, 24), "scripts/test")
 
 
 def test_pictures_are_small():

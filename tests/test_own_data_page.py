@@ -85,6 +85,21 @@ def test_every_block_of_the_page_runs(page, recording, capsys):
     assert seen.pupil.ok.all()
 
 
+def test_a_rig_file_numbers_the_glints_of_a_video(page, recording, capsys):
+    headers = []
+    rig = (page / "rig.yaml").read_text(encoding="utf-8").replace("[640, 480]", "[320, 240]")
+    (page / "rig.yaml").write_text(rig, encoding="utf-8")
+    for more in ([], ["--scene", "rig.yaml"]):
+        assert run(["extract", "recording.mp4", "--gamma", "2.2", "-o", "features.csv", *more]) == 0
+        headers.append((page / "features.csv").read_text(encoding="utf-8").splitlines()[0].split(","))
+    assert "glint1_x" in headers[1]
+    assert "glint1_x" not in headers[0]
+    (page / "rig.yaml").write_text("format: 1\ncameras: []\nlights: [{}]\n", encoding="utf-8")
+    capsys.readouterr()
+    assert run(["extract", "recording.mp4", "--scene", "rig.yaml"]) == 2
+    assert "error: rig.yaml: lights.0: give either position_mm or ring" in capsys.readouterr().err
+
+
 def test_every_name_on_the_page_exists():
     names = set(re.findall(r"\ber\.((?:gaze\.)?\w+)", PAGE)) - {"gaze"}
     for name in names:

@@ -78,6 +78,31 @@ def test_both_observers_agree_within_a_fraction_of_a_pixel(folder):
     assert gaze["image"]["mean_deg"] < 1.0
 
 
+def test_the_pages_quote_what_the_quickstart_prints(folder):
+    """README and first hour; rendering rounds by the processor, so the last digit of the README may differ."""
+    data = json.loads((folder.parent / "result.json").read_text())
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    first = (ROOT / "docs" / "first_hour.md").read_text(encoding="utf-8")
+    sums, gaze = data["features"], data["gaze"]
+    printed = {
+        "pupil centre": (sums["pupil_centre_px"]["median"], sums["pupil_centre_px"]["max"]),
+        "glint": (sums["glint_px"]["median"], sums["glint_px"]["max"]),
+        "gaze error, features from ray optics": (gaze["analytic"]["mean_deg"], gaze["analytic"]["max_deg"]),
+        "gaze error, features from the images": (gaze["image"]["mean_deg"], gaze["image"]["max_deg"]),
+    }
+    for name, values in printed.items():
+        (row,) = re.findall(rf"^\| {name}[^|]*\|(.*)\|$", readme, re.MULTILINE)
+        assert [float(one) for one in re.findall(r"\d\.\d+", row)] == pytest.approx(values, abs=1.5e-3), name
+    for name, values in (("analytic", printed["gaze error, features from ray optics"]),
+                         ("image", printed["gaze error, features from the images"])):  # fmt: skip
+        (row,) = re.findall(rf"^  {name} (.*)$", first, re.MULTILINE)
+        assert [float(one) for one in row.split()[:2]] == pytest.approx(values, abs=1e-3), name
+    for name, key in (("pupil centre", "pupil_centre_px"), ("semi-axes", "semi_axes_px"), ("glint", "glint_px")):
+        (row,) = re.findall(rf"^  {name} (.*)$", first, re.MULTILINE)
+        wanted = [sums[key][part] for part in ("median", "p95", "max")]
+        assert [float(one) for one in row.split()] == pytest.approx(wanted, abs=1e-3), name
+
+
 def test_repeating_renders_nothing_again_and_another_job_is_refused(folder, capsys):
     before = (folder / "images" / "000000_right.png").stat().st_mtime_ns
     assert run(["quickstart", str(folder)]) == 0

@@ -410,9 +410,11 @@ def sources_of_eyes() -> str:
     lines = ["# Sources of the shipped eyes", ""]
     for name in catalogue_names():
         eye = load_eye(name)
-        lines += [f"## {name}", "", eye.description, "", "| keys | source |", "|---|---|"]
-        lines += [f"| `{key}` | {cell(text)} |" for key, text in eye.sources.items()]
-        lines.append("")
+        lines += [f"## {name}", "", eye.description, "", "<details>", f"<summary>Sources of {name}</summary>", ""]
+        lines += ["| keys | source |", "|---|---|"]
+        links = {key: re.sub(r"docs/(\w+)\.md", r"[\1](../\1.md)", cell(text)) for key, text in eye.sources.items()}
+        lines += [f"| `{key}` | {text} |" for key, text in links.items()]
+        lines += ["", "</details>", ""]
     return "\n".join(lines)
 
 

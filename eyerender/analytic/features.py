@@ -274,7 +274,7 @@ class View:
         return self._in_mirror(seen if plain else camera.pixels_of(seen[..., 0], seen[..., 1]), found)
 
     def _in_mirror(self, pixels: Floats, status: Statuses) -> tuple[Floats, Statuses]:
-        """Remove pixels beside the outline of the camera's mirror; `status` is changed."""
+        """Remove pixels outside the outline of the camera's mirror; `status` is changed."""
         if (beside := self.camera.beside_mirror(pixels)) is None:
             return pixels, status
         mark(status, beside, Status.BESIDE_MIRROR)

@@ -40,7 +40,7 @@ ARC_GAP_DEG = 120.0
 
 
 class TraceableScene(Protocol):
-    """What ray optics needs of a scene: its numeric rig and eyes."""
+    """Inputs of ray optics: the numeric rig and eyes of a scene."""
 
     @property
     def rig(self) -> RigGeometry:
@@ -86,7 +86,7 @@ class TraceableScene(Protocol):
 
 @runtime_checkable
 class Traceable(Protocol):
-    """What ray optics needs of `Frames`: which eye is seen by which camera, and its pose."""
+    """Part of `Frames` that ray optics reads: which camera sees which eye, and its pose."""
 
     @property
     def scene(self) -> TraceableScene:

@@ -1,4 +1,4 @@
-"""What hides features besides the eye itself: obstacles of the rig, and openings that frame a camera's picture."""
+"""Occlusion of features by obstacles of the rig and by openings that frame a camera's picture."""
 
 from __future__ import annotations
 

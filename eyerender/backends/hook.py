@@ -1,4 +1,4 @@
-"""What must happen before drjit is imported, whoever imports it: the package, a notebook, `import mitsuba`.
+"""Set-up that must precede any import of drjit, by the package, a notebook or `import mitsuba`.
 
 Dr.Jit reads its settings and loads a libLLVM when it is first imported, and keeps both. `import eyerender` installs
 this hook, so afterwards the order of imports is free.

@@ -1,1 +1,1 @@
-"""What every package uses: errors, array values, specs, storage, progress, processes, compilation, versions."""
+"""Foundations of all packages: errors, array values, specs, storage, progress, processes, compilation, versions."""

@@ -62,7 +62,7 @@ def _folder() -> Path | None:
 
 
 def used(folder: Path) -> Path:
-    """Mark a folder of machine code as recently used; if it does not exist yet, remove outdated ones beside it."""
+    """Mark a folder of machine code as recently used; if it does not exist yet, remove outdated folders next to it."""
     with suppress(OSError):
         if folder.exists():
             os.utime(folder)

@@ -15,7 +15,7 @@ from .arrays import Bools, Statuses
 class Status(IntEnum):
     """Outcome of a ray, a ray search, a fixation, a feature or an estimate.
 
-    The numbers beside a status are complete only where it is OK. NONE marks padding: an entry that does not exist.
+    The numbers of an entry are complete only where its status is OK. NONE marks padding: an entry that does not exist.
 
     >>> er.Status.OUTSIDE_LIMBUS.reason
     'outside the limbus'

@@ -36,7 +36,7 @@ from .targets import check_outputs
 
 
 def usage_error(error: CycloptsError) -> str:
-    """Write one line that states what is wrong with a command line, and what to write instead."""
+    """Write one line that states the mistake in a command line and its correction."""
     command = " ".join(("eyerender", *(error.command_chain or ())))
     spare = [token for token in error.unused_tokens or () if not token.startswith("-")]
     if isinstance(error, UnknownCommandError) and error.unused_tokens:

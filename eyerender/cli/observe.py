@@ -112,6 +112,20 @@ def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px:
     return trace.to_mapping()
 
 
+def _rig_scene(name: str, heed: Heed) -> Scene:
+    """Load a scene, or put both eyes of an average person before the rig of a rig file."""
+    from ..gaze.records import RigFile, is_rig_file
+    from ..scene import Scene
+    from ..scene.spec import SceneSpec
+
+    if not is_rig_file(name):
+        return heed.scene(name)
+    rig = RigFile.load(name).resolved(Path(name).parent).to_mapping()
+    del rig["format"]
+    spec = {"format": SceneSpec.FORMAT, "name": "rig", "eye": {"model": "adult"}, "rig": rig}
+    return Scene.of(SceneSpec.from_mapping({**spec, "targets": {"world_mm": [[600, 0, 0]]}}, source=name))
+
+
 @app.command(name="extract")
 def extract(
     *images: Path,
@@ -140,7 +154,7 @@ def extract(
 
     Args:
         images: Greyscale images, one folder of images, or one video.
-        scene: A scene with the rig; glints are assigned to its lights and listed in their order.
+        scene: A scene with the rig, or a rig file; glints are assigned to its lights and listed in their order.
         camera: Number of the scene's camera that took the images (default: 0).
         gamma: Encoding gamma of the pixel values (default: 1, linear; 8-bit videos are mostly encoded with 2.2).
         method: fast: edges and an algebraic fit; refined: also a maximum-likelihood fit; centroid: area (pi a b) and
@@ -169,7 +183,7 @@ def extract(
 
     _check_extract(images, gamma, eyes)
     heed = Heed(strict)
-    loaded = None if scene is None else heed.scene(scene)
+    loaded = None if scene is None else _rig_scene(scene, heed)
     special = {"arrangement": arrangement, "order": order, "reflections": reflections}
     for name, value in special.items():
         needed = "--method centroid" if name == "reflections" else "--eyes 2"

@@ -24,7 +24,7 @@ def study(
     options: Annotated[StudyOptions, Parameter(name="*")] = StudyOptions(),
     json: Result = None,
 ) -> int:
-    """Replicate a published gaze study, measure over people what others left open, or run a study of your own.
+    """Replicate a published gaze study, answer open questions of such studies over people, or run a study of your own.
 
     The folder receives summary.json, findings.json, both as CSV, and report.html. A folder of the same study is updated
     in place. Rendered images form a dataset in images/: an interrupted run resumes, and finished images are reused.

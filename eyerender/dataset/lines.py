@@ -21,7 +21,7 @@ from ..folders.imagefolder import LINES, METADATA, SHARDS, finished, shard_name
 
 @dataclass(frozen=True, slots=True)
 class ShardLines:
-    """Where lines stand in a metadata.jsonl: shard -> sample, first byte and length of each, in the shard's order."""
+    """Places of lines in a metadata.jsonl: shard -> sample, first byte and length of each, in the shard's order."""
 
     path: Path
     places: dict[int, list[tuple[int, int, int]]]

@@ -103,7 +103,7 @@ class PlanOptions:
         if self.clips is None:
             return count
         if count is not None:
-            raise InputError("cannot stand beside --count, the number of their frames", source="--clips")
+            raise InputError("cannot be combined with --count, the number of their frames", source="--clips")
         if spec.clip_frames == 1:
             raise InputError("needs a dataset of sequences", source="--clips")
         if self.clips < 1:

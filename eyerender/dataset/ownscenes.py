@@ -52,7 +52,7 @@ class GivenScene:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnScenes:
-    """Where the scenes of a plan come from, if not from its spec."""
+    """Origin of the scenes of a plan that do not come from its spec."""
 
     reference: str  # `module:function`; empty where the scenes are handed over one by one (`DatasetWriter`)
     sha256: str = ""  # SHA-256 of the module's file; empty where it has none

@@ -613,7 +613,7 @@ def _child(node: Any, key: str) -> Any:
 
 
 def _adjusted(tree: Mapping[str, Any], seed: tuple[int, ...]) -> dict[str, Any]:
-    """Return the rig of a scene, set to the wearer's distance of the eyes but for a residual that is drawn."""
+    """Return the rig of a scene, set to the wearer's distance of the eyes plus a drawn residual."""
     spec = SceneSpec.from_mapping(tree)
     adjust = spec.rig.set_to(spec.subject.ipd_mm).ipd_adjust
     assert adjust is not None

@@ -374,7 +374,7 @@ class Run:
             shard, reason = next(iter(lost.items()))
             raise EyerenderError(
                 f"{len(lost)} of {len(todo)} shards could not be made; shard {shard}: {reason}; "
-                "the others are kept; start again to retry these"
+                "finished shards are kept; start again to retry these"
             )
 
     def repaired(self, what: str) -> None:

@@ -167,13 +167,13 @@ class DatasetSpec(FileSpec):
     def _check(self) -> Self:
         self._check_clips()
         if self.population is not None and self.eye_parameters:
-            raise ValueError("eye_parameters: cannot stand beside a population; use its 'replace'")
+            raise ValueError("eye_parameters: cannot be combined with a population; use its 'replace'")
         for name in self.variables or {}:
             if not (name.isidentifier() and name.isascii()) or name in FUNCTIONS or keyword.iskeyword(name):
                 raise ValueError(f"variables.{name}: a name must be a plain word that is no function")
         for key in ("population", "person"):
             if key in self.scene:
-                raise ValueError(f"scene.{key}: write 'population' beside 'scene', not in it")
+                raise ValueError(f"scene.{key}: write 'population' next to 'scene', not in it")
         self._check_splits()
         return self
 
@@ -244,7 +244,7 @@ class DatasetSpec(FileSpec):
 
     @property
     def selection(self) -> Selection | ClipSelection:
-        """Which samples are made, and in which shards."""
+        """Plan of a dataset: its samples and the shards that hold them."""
         spread, n = self.choice == "spread" and self.count % self.planned_count > 0, self.clip_frames
         found = _selection(
             count=self.count // n,
@@ -280,7 +280,7 @@ def _clip_frames(duration_s: Any, rig: Any) -> int:
     cameras = rig.get("cameras") if isinstance(rig, Mapping) else None
     given = [c.get("frame_rate_hz") for c in cameras if isinstance(c, Mapping)] if isinstance(cameras, list) else []
     if any(isinstance(rate, Mapping) for rate in given) or not isinstance(duration_s, int | float):
-        raise ValueError("scene.sequence.duration_s: it, and frame_rate_hz of the cameras, must be plain numbers")
+        raise ValueError("scene.sequence.duration_s: must be a plain number, and so must frame_rate_hz of the cameras")
     rates = {DEFAULT_RATE_HZ if rate is None else rate for rate in given or [None]}
     if len(rates) > 1:
         raise ValueError("scene.rig.cameras: must have one frame_rate_hz in a dataset of sequences")

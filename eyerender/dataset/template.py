@@ -292,7 +292,7 @@ def _check_reference(node: Mapping[str, Any], path: str, variables: Mapping[str,
         InputError: the expression is not allowed; the error has no path yet.
     """
     if set(node) != {REFERENCE}:
-        raise InputError(f"no other key may stand beside {REFERENCE!r}")
+        raise InputError(f"no other key may be combined with {REFERENCE!r}")
     for name in names_of(str(node[REFERENCE])):
         if name not in variables:
             known = ", ".join(sorted(variables)) or "none"

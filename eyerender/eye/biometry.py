@@ -80,7 +80,7 @@ def with_biometry(data: Mapping[str, Any]) -> dict[str, Any]:
     """Replace `biometry` in the keys of an eye file by what follows from it; InputError if a number does not fit it."""
     for key in MEASURED:
         if key in data:
-            raise InputError("cannot stand beside 'biometry', from which it follows", path=key)
+            raise InputError("cannot be combined with 'biometry', from which it follows", path=key)
     try:
         made = BiometrySpec.from_mapping(data["biometry"]).keys()
     except InputError as error:

@@ -195,9 +195,9 @@ class SpectacleLens(Spec):
         if self.surfaces is not None:
             for name in _PRESCRIBED:
                 if getattr(self, name) != type(self).model_fields[name].default:
-                    raise KeyProblem(name, "cannot stand beside `surfaces`, which give the lens as made")
+                    raise KeyProblem(name, "cannot be combined with `surfaces`, which give the lens as made")
         if self.material is not None and self.index is not None:
-            raise KeyProblem("index", "cannot stand beside `material`")
+            raise KeyProblem("index", "cannot be combined with `material`")
         if self.surfaces is None and self.nominal_index <= 1.0 and (self.sphere_d or self.cylinder_d):
             raise KeyProblem("index", "must be > 1 for a lens with power")
         try:

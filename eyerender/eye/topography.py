@@ -121,7 +121,7 @@ def with_topographies(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def _fitted(node: Mapping[str, Any], path: str, folder: Path) -> dict[str, Any]:
     for key in ("heights_mm", "spacing_mm"):
         if node.get(key) is not None:
-            raise InputError("cannot stand beside 'file'", path=f"{path}.{key}")
+            raise InputError("cannot be combined with 'file'", path=f"{path}.{key}")
     try:
         spec = TopographySpec.from_mapping(node["file"])
     except InputError as error:

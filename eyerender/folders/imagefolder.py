@@ -201,7 +201,7 @@ class ImageEntry:
         return self.pixels("lens_reflection_mask_file_name")
 
     def instance_mask(self) -> Bytes | None:
-        """Read what each pixel shows, with lids, lashes, brow and skin apart (docs/formats.md); like `mask`."""
+        """Read what each pixel shows, with separate lids, lashes, brow and skin (docs/formats.md); like `mask`."""
         return self.pixels("instance_mask_file_name")
 
     def depth(self) -> Singles | None:

@@ -1,4 +1,4 @@
-"""What the package's estimators have in common: options, and the calibration of each eye, as values for a file."""
+"""Common parts of the package's estimators: options, and the calibration of each eye, as values for a file."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def load_observations(
     >>> seen, rig = er.gaze.load_observations("recording.csv", rig="rig.yaml")  # doctest: +SKIP
 
     Args:
-        path: JSON as `features` writes it, which includes the rig; JSONL with one record a line; or a table (.csv or
+        path: JSON as `features` writes it, which includes the rig; JSONL with one record per line; or a table (.csv or
             .tsv, see `observations_from_csv`).
         scene: scene whose rig is used if the file has none. Its subject also places eyes whose place is not recorded.
         rig: the rig to use instead, or a file that `load_rig` reads.

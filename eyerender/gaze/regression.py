@@ -121,7 +121,7 @@ class PolynomialEstimator(BuiltIn, Generic[Fit]):
         """Return a copy with these coefficients.
 
         Raises:
-            InputError: they are not as many as the terms; a wrong function is an error here, too.
+            InputError: their number is not that of the terms, or the function is unknown.
         """
         for key, terms in zip("ab", self.terms, strict=True):
             for eye, fit in eyes.items():

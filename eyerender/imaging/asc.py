@@ -90,7 +90,7 @@ def _header(trace: Trace, eyes: Sequence[_Eye], screen_px: tuple[int, int]) -> I
 
 
 class _Events(NamedTuple):
-    """The runs of an eye by their first and by their last sample."""
+    """Index the runs of an eye by their first and by their last sample."""
 
     begins: dict[int, Stretch]
     ends: dict[int, Stretch]

@@ -170,10 +170,10 @@ def begin_each(
     annotated: bool = False,  # whether to compute the masks that people would draw
     geometry: tuple[str, ...] = (),  # kinds of geometry to find: depth, normals, iris_coordinates, instances
 ) -> Iterator[BegunImage]:
-    """Trace the rows of many frames in order; a second thread makes their images, beside the tracing of the next.
+    """Trace the rows of many frames in order; a second thread turns each trace into an image meanwhile.
 
     The next frames are fetched before the last ones are traced, so that a second thread can prepare them. If fetching
-    fails, the frames at hand are traced first.
+    fails, the frames fetched so far are traced first.
 
     Raises:
         InputError: a scene's windows cannot be rendered.

@@ -1,4 +1,4 @@
-"""What a tracker reports of the gaze of each eye in a trace: where the line of sight meets the screen, and the pupil.
+"""Gaze of each eye in a trace as a tracker reports it: where the line of sight meets the screen, and the pupil.
 
 Gaze is the true line of sight with the tracker's noise in degrees. Positions on a screen are in pixels from its upper
 left corner. Without a screen they are the azimuth and the elevation of the line of sight in the world, in degrees.

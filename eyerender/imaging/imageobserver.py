@@ -398,7 +398,7 @@ def detect(
 
 
 def rigs_of(folder: ImageFolder) -> list[RigGeometry]:
-    """Return the rig of each record of a folder, in order; equal rigs, but for their power, are one object.
+    """Return the rig of each record of a folder, in order; rigs that differ in power alone are one object.
 
     Raises:
         InputError: an image's scene is missing or wrong.

@@ -1,4 +1,4 @@
-"""What pictures need of a scene and its frames; `Scene` and `Frames` have it, with much else."""
+"""Protocols of a scene and its frames for rendering; `Scene` and `Frames` fulfil them."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class RenderableScene(TraceableScene, Protocol):
 
     @property
     def spec(self) -> PictureSettings:
-        """What the scene's file says."""
+        """Spec of the scene, as in its file."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""What the moments of an exposure share: lids that hardly move, and the part of the picture that stands still.
+"""Parts that the moments of an exposure share: lids that hardly move, and the still part of the picture.
 
 The eye turns by many pixels while the lids, which follow its cornea, move by a few, and the skin around them hardly at
 all. So only the globe is that of each moment. Lids are posed anew where they have moved by a quarter of a pixel. Beyond

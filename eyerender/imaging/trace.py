@@ -1,4 +1,4 @@
-"""What a fast tracker would report of a sequence: truth and analytic features at a steady rate, without pictures.
+"""Sequence as a fast tracker would report it: truth and analytic features at a steady rate, without pictures.
 
 The samples are instants, whatever the cameras' own rates and shutters are. A tracker's noise has a size and a type
 (RMS-S2S over SD; Niehorster et al. 2020), and a share of its samples is lost. Where lids cover the pupil's middle, and

@@ -69,7 +69,7 @@ def biconic_through(y: Floats, z: Floats, x: Floats) -> Floats:
 def spline_coefficients(values: Floats) -> Floats:
     """Compute the coefficients (n + 2, m + 2) of the cubic B-splines through values (n, m) on a uniform grid.
 
-    The end condition is the one without a knot beside the end. With the second derivative s'' of that interpolant,
+    The end condition is "not a knot". With the second derivative s'' of that interpolant,
     c_i = s_i - h^2 s''_i / 6 at the knots; the outermost ones follow from c_(i-1) - 2 c_i + c_(i+1) = h^2 s''_i.
     """
     for axis in (0, 1):

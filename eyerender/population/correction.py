@@ -1,4 +1,4 @@
-"""What people wear against their refractive error: prescriptions from drawn refractions, and who wears what.
+"""Glasses and contact lenses of drawn people: prescriptions from drawn refractions, and who wears which kind.
 
 A drawn refraction is that of spectacles at the table's vertex distance d: the power matrix F leaves light of the
 vergence K = F (1 - d F)^-1 at the cornea. Spectacles at the distance v need F' = K (1 + v K)^-1, and a soft contact
@@ -21,7 +21,7 @@ from .table import default_table
 
 
 class Wearer(Protocol):
-    """What is asked of a person: see `people.Person`."""
+    """Properties of a person that this module reads: see `people.Person`."""
 
     def number(self, name: str, side: Side | None = None) -> float:
         """Return a number of the person, or of one eye."""

@@ -659,13 +659,13 @@ class PinholeCamera(ArrayValue):
         return np.asarray(np.hypot(x[None, :], y[:, None]) > reach)
 
     def beside_mirror(self, pixels: Floats) -> Bools | None:
-        """Return which pixels (..., 2) have rays beside the outline of the mirror; None without an outline."""
+        """Return which pixels (..., 2) have rays that miss the outline of the mirror; None without an outline."""
         if self.mirror is None or self.mirror.corners_mm is None:
             return None
         return ~self.mirror.holds(self.rays(pixels) @ self.R.T)
 
     def dark(self, window: Window) -> Bools | None:
-        """Return which pixels (h, w) of a window get no light: without a ray, or beside the mirror; None if all do."""
+        """Return which pixels (h, w) of a window get no light: without a ray, or past the mirror; None if all do."""
         beyond, (x0, y0, width, height) = self.without_rays(window), window
         if self.mirror is None or self.mirror.corners_mm is None:
             return beyond

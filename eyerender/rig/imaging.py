@@ -1,4 +1,4 @@
-"""How pictures are taken: what is rendered of the sensor, focus, vignetting, motion, ambient light."""
+"""Settings of pictures: rendered window of the sensor, focus, vignetting, motion, ambient light."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class IpdAdjustment(Spec):
     range_mm: tuple[Positive, Positive] = Field(description="least and largest setting")
     residual_mm: NonNegative = Field(
         default=0.0,
-        description="standard deviation of what remains between each eye and its parts, along y, for drawn people",
+        description="standard deviation of the remaining offset along y of an eye from its parts, for drawn people",
     )
     design_mm: Positive = Field(default=63.0, description="setting at which the parts are where the rig says")
     set_mm: Positive | None = Field(

@@ -77,7 +77,7 @@ class Pulse(Spec):
 
 
 class Light(NamedTuple):
-    """What rows get of a pulse, arrays of one shape: the middle of the overlap (s; NaN without one), and its share."""
+    """Overlap of rows with a pulse, arrays of one shape: its middle (s; NaN without one), and its share."""
 
     time_s: Floats
     share: Floats

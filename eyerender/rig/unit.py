@@ -184,7 +184,7 @@ def _of_windows(given: Any, source: str, k: int) -> dict[str, Any]:
     if model != _RATIONAL or len(values) not in (14, 15):
         raise InputError(f"the model {shown(model)} is not supported; {_RATIONAL} is", source=source, path=path)
     if values[10] != 0 or values[11] != 0:
-        raise InputError("a centre of distortion beside the principal point is not supported", source=source, path=path)
+        raise InputError("a centre of distortion off the principal point is not supported", source=source, path=path)
     (cx, cy, fx, fy), (p2, p1) = values[:4] * np.tile(size, 2), values[12:14]
     error_px = max(abs(p1) * fx, abs(p2) * fy) * size[0] * size[1] / abs(4 * fx * fy)
     if not error_px <= _TANGENTIAL_PX:

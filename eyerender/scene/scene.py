@@ -631,7 +631,7 @@ class Scene:
 
     @property
     def frame_count(self) -> int:
-        """How many frames there are, one for each head position, fixation and camera, whether it sees an eye or not."""
+        """Number of frames, one for each head position, fixation and camera, whether it sees an eye or not."""
         if (sequence := self.spec.sequence) is not None:
             return len(self.rig.cameras) * (instants_of(self) if sequence.instants is None else len(sequence.instants))
         fixations = len(self.spec.poses or ()) if self.targets_mm is None else len(self.targets_mm)
@@ -705,7 +705,7 @@ class Scene:
         return stops_of(self, index)
 
     def eye_at(self, index: Index, row: int) -> EyeModel:
-        """Build the numeric eye of one row, with the pupil as it is then."""
+        """Build the numeric eye of one row, with its pupil at that time."""
         eye = self.eye(EYES[index.eye[row]], tuple(index.head_mm[row]))
         stops = self.stops_of(index.take([row]))
         return eye if stops is None else _with_stop(_Same(eye), take_rows(stops, 0))

@@ -89,12 +89,12 @@ class Eye(Spec):
     @model_validator(mode="after")
     def _one_eye(self) -> Self:
         if self.biometry is not None and "model" in self.model_fields_set:
-            raise KeyProblem("biometry", "cannot stand beside 'model'; both say which eye it is")
+            raise KeyProblem("biometry", "cannot be combined with 'model'; both say which eye it is")
         return self
 
     @model_serializer(mode="wrap")
     def _without_default(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out the default model, which does not hold beside `biometry`."""
+        """Leave out the default model where `biometry` is given."""
         found: dict[str, Any] = serialise(self)
         return found if self.biometry is None else {key: value for key, value in found.items() if key != "model"}
 
@@ -322,7 +322,7 @@ class SceneSpec(FileSpec):
 
     def _check_sequence(self) -> None:
         if self.motion is not None:
-            raise KeyProblem("motion", "cannot stand beside a sequence, which moves eyes and head")
+            raise KeyProblem("motion", "cannot be combined with a sequence, which moves eyes and head")
         if len(self.subject.head_positions_mm) > 1:
             raise KeyProblem("subject.head_positions_mm", "must be one with a sequence, which moves the head")
         gaze = self.sequence.gaze if self.sequence is not None else None
@@ -342,13 +342,13 @@ class SceneSpec(FileSpec):
             raise KeyProblem("subject.spectacles", "frames are drawn around eyes with a region and without a head mesh")
         if self.person is not None:
             if subject.age_years is not None:
-                raise KeyProblem("subject.age_years", "cannot stand beside a drawn person, who has an age")
+                raise KeyProblem("subject.age_years", "cannot be combined with a drawn person, who has an age")
             return
         if subject.luminance_cd_m2 is None:
             if subject.field_deg is not None:
                 raise KeyProblem("subject.field_deg", "needs subject.luminance_cd_m2")
         elif self.eye.pupil_diameter_mm is not None:
-            raise KeyProblem("subject.luminance_cd_m2", "cannot stand beside eye.pupil_diameter_mm; both set the pupil")
+            raise KeyProblem("subject.luminance_cd_m2", "cannot be combined with eye.pupil_diameter_mm: both set it")
 
     @classmethod
     def arranged(cls, data: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -425,9 +425,9 @@ def _peopled(data: Mapping[str, Any]) -> dict[str, Any]:
     eye = data.get("eye")
     for key in ("model", "biometry"):
         if isinstance(eye, Spec) or (isinstance(eye, Mapping) and key in eye):
-            raise InputError("cannot stand beside a population, which gives the eyes", path=f"eye.{key}")
+            raise InputError("cannot be combined with a population, which gives the eyes", path=f"eye.{key}")
     if data.get("person") is not None:
-        raise InputError("cannot stand beside a population, which gives the person", path="person")
+        raise InputError("cannot be combined with a population, which gives the person", path="person")
     given = data["population"]
     try:
         person = chosen_person(given.to_mapping() if isinstance(given, Spec) else given)

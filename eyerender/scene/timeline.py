@@ -34,11 +34,11 @@ from .spec import MAX_OBSERVATIONS, SceneSpec
 
 
 class TimedScene(Protocol):
-    """What the frames in time need of a `Scene`."""
+    """Part of a `Scene` that frames in time read."""
 
     @property
     def spec(self) -> SceneSpec:
-        """What the scene's file says."""
+        """Spec of the scene, as in its file."""
         ...
 
     @property

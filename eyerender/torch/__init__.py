@@ -4,7 +4,7 @@ This module needs PyTorch (the extra `torch`). `import eyerender` does not load 
 
 Both datasets yield each image as a mapping with the requested parts, some of `PARTS`; docs/training.md has a table of
 them. Numbers that are unknown are nan. `valid` is a mapping from each label among the parts to bool tensors: one for an
-ellipse, a vector or `eye`, one per lamp, landmark, point or number of others. Labels of the pupil and of the gaze are
+ellipse, a vector or `eye`, and one per lamp, landmark, point or number elsewhere. Labels of the pupil and the gaze are
 not valid while under a tenth of the pupil shows. Glints and landmarks are valid in the picture alone.
 
 Pictures of any bit depth become shares of the full scale, so folders of different sensors can be joined; with `size`,

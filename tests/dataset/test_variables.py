@@ -173,7 +173,7 @@ def test_an_aliased_draw_is_warned_of(tmp_path):
         ({"darw": "uniform", "low": 3, "high": 5}, "pupil_diameter_mm.darw: unknown key; did you mean 'draw'?"),
         ({"draw": "uniform", "low": 3, "hihg": 5}, "pupil_diameter_mm.hihg: unknown key"),
         ({"var": "x + y"}, "pupil_diameter_mm: there is no variable 'y'; the spec has x"),
-        ({"var": "x", "low": 3}, "pupil_diameter_mm: no other key may stand beside 'var'"),
+        ({"var": "x", "low": 3}, "pupil_diameter_mm: no other key may be combined with 'var'"),
         ({"var": "__import__('os')"}, "pupil_diameter_mm: \"__import__('os')\" is not made of numbers"),
         ({"draw": "multivariate_normal", "mean": [1, 2], "covariance": [[1, 2], [2, 1]]}, "positive definite"),
         (

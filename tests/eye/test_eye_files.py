@@ -348,9 +348,9 @@ def test_impossible_numbers_name_the_key(change, message):
 
 
 def test_biometry_stands_beside_no_other_eye():
-    with pytest.raises(er.InputError, match=r"^biometry: cannot stand beside 'model'"):
+    with pytest.raises(er.InputError, match=r"^biometry: cannot be combined with 'model'"):
         er.Eye("E4", biometry=NUMBERS)
-    with pytest.raises(er.InputError, match=r"^retina: cannot stand beside 'biometry'"):
+    with pytest.raises(er.InputError, match=r"^retina: cannot be combined with 'biometry'"):
         EyeSpec.from_mapping({"biometry": NUMBERS, "retina": {}})
 
 

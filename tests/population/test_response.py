@@ -78,7 +78,7 @@ def test_a_given_pupil_stays():
         ({"model": "E2", "accommodation_d": 2}, "subject.accommodation_d: needs an eye whose lens has a front"),
         ({"accommodation_d": "near"}, "subject.accommodation_d: "),
         ({"field_deg": 40}, "subject.field_deg: needs subject.luminance_cd_m2"),
-        ({"luminance_cd_m2": 5, "eye": {"pupil_diameter_mm": 3}}, "subject.luminance_cd_m2: cannot stand beside"),
+        ({"luminance_cd_m2": 5, "eye": {"pupil_diameter_mm": 3}}, "subject.luminance_cd_m2: cannot be combined with"),
     ],
 )
 def test_what_cannot_respond_names_the_key(more, message):
@@ -87,7 +87,7 @@ def test_what_cannot_respond_names_the_key(more, message):
 
 
 def test_a_drawn_person_has_an_age():
-    with pytest.raises(er.InputError, match=r"subject.age_years: cannot stand beside a drawn person"):
+    with pytest.raises(er.InputError, match=r"subject.age_years: cannot be combined with a drawn person"):
         er.SceneSpec.from_mapping(scene_mapping(subject={"age_years": 30}))
 
 

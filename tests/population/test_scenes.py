@@ -143,7 +143,7 @@ def test_with_another_population(scene):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"eye": {"model": "E4"}}, "eye.model: cannot stand beside a population"),
+        ({"eye": {"model": "E4"}}, "eye.model: cannot be combined with a population"),
         ({"population": {"preset": "none"}}, "population.preset: must be one of"),
         ({"population": {"subject": -1}}, "population.subject: must be >= 0"),
         ({"population": {"where": {"age_years": 5}}}, "population.where.age_years: nobody"),
@@ -193,8 +193,8 @@ def test_a_subject_whose_eye_cannot_be_is_drawn_again():
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"eye_parameters": {"E2": {"limbus_radius_mm": 5.8}}}, "eye_parameters: cannot stand beside a population"),
-        ({"scene": {"rig": RIG, "population": {}}}, "scene.population: write 'population' beside"),
+        ({"eye_parameters": {"E2": {"limbus_radius_mm": 5.8}}}, "eye_parameters: cannot be combined with a population"),
+        ({"scene": {"rig": RIG, "population": {}}}, "scene.population: write 'population' next to"),
     ],
 )
 def test_wrong_datasets_name_the_key(more, message):

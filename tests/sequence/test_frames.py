@@ -220,7 +220,7 @@ def test_a_wrong_trace_ends_with_one_line(arguments, message, capsys, tmp_path, 
     ("change", "message"),
     [
         ({"targets": {"world_mm": [[600, 0, 0]]}}, "give either targets or poses, or a sequence"),
-        ({"motion": {"eye_deg_s": [10.0, 0.0]}}, "motion: cannot stand beside a sequence"),
+        ({"motion": {"eye_deg_s": [10.0, 0.0]}}, "motion: cannot be combined with a sequence"),
         ({"sequence": {"gaze": {"grid": [3, 3]}}}, r"targets on a screen need rig\.screen"),
         ({"sequence": {"gaze": {"time_s": [1.0, 0.5], "azimuth_deg": [0, 0], "elevation_deg": [0, 0]}}}, "must rise"),
         ({"sequence": {"gaze": {"targets": [[-50.0, 0.0, 0.0]]}}}, "cannot fixate"),

@@ -1,4 +1,4 @@
-"""The tables of docs/studies.md: they are those of the stored results, and a run gives the stored results."""
+"""The tables of docs/studies*.md: they are those of the stored results, and a run gives the stored results."""
 
 from __future__ import annotations
 
@@ -16,16 +16,10 @@ script = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(script)
 
 
-def test_the_page_has_the_tables_of_the_stored_results():
-    data = json.loads(script.DATA.read_text(encoding="utf-8"))
-    page = script.PAGE.read_text(encoding="utf-8")
-    assert script.page_with(page, script.tables(data)) == page, "run scripts/study_tables.py"
-
-
-def test_the_page_over_people_has_the_tables_of_the_stored_results():
-    data = json.loads(script.PEOPLE_DATA.read_text(encoding="utf-8"))
-    page = script.PEOPLE_PAGE.read_text(encoding="utf-8")
-    assert script.page_with(page, script.people_tables(data)) == page, "run scripts/study_tables.py"
+def test_the_pages_have_the_tables_of_the_stored_results():
+    data, people = (json.loads(path.read_text(encoding="utf-8")) for path in (script.DATA, script.PEOPLE_DATA))
+    for path, text in script.pages_with({**script.tables(data), **script.people_tables(people)}).items():
+        assert path.read_text(encoding="utf-8") == text, "run scripts/study_tables.py"
 
 
 @pytest.mark.slow
@@ -39,7 +33,7 @@ def test_a_run_over_people_gives_the_stored_results(name, tmp_path):
 
 
 def test_the_page_lists_every_sentence_with_its_rules():
-    page = script.PAGE.read_text(encoding="utf-8")
+    page = (ROOT / "docs/studies_sentences.md").read_text(encoding="utf-8")
     for rule in lit.RULES.values():
         sentence = lit.SENTENCES.get(rule["sentence"])
         if sentence:

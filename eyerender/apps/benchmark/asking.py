@@ -290,6 +290,6 @@ class _Asker:
 
 
 def _prior(pupil: Ellipse) -> dict[str, Any]:
-    """Return what an extractor is told of the pupil that it found last, in this package's conventions."""
+    """Return the hint on the pupil that an extractor found last, in this package's conventions."""
     x, y, a, b, angle = pupil.numbers()
     return {"centre_px": [x, y], "semi_axes_px": [a, b], "angle_rad": angle}

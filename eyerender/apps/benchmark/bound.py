@@ -51,7 +51,7 @@ class Edge:
         return self.noise_dn / abs(self.step_dn) * math.sqrt(2.0 * self.sigma_px / (math.sqrt(math.pi) * radius))
 
     def factors(self) -> dict[str, float]:
-        """Return what a measured edge tells about possible causes of an error, and how well it was measured."""
+        """Describe the possible causes of an error that a measured edge suggests, and how well it was measured."""
         return {
             "noise_dn": self.noise_dn,
             "blur_px": math.sqrt(max(self.sigma_px**2 - 1.0 / 12.0, 0.0)),

@@ -493,7 +493,7 @@ def _how(data: Row) -> list[str]:
 
 
 def _lead(data: Row) -> list[str]:
-    """What is compared, and when a pupil counts as right."""
+    """Explain what is compared, and when a pupil counts as right."""
     lead = [
         "Every extractor ran in its own process, on the same images and with the same information: the image, its bit "
         "depth and, if the folder has a rig, the rig and the range of likely pupil sizes, but never the truth.",

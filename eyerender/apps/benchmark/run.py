@@ -105,7 +105,7 @@ def bench_extractors(
 
 
 def _labelled(folder: str | Path, options: BenchOptions) -> list[BenchImage]:
-    """Load the images of a labelled folder, or a tenth of them, with the pupils' edges."""
+    """Load the images of a labelled folder, or every tenth of them, and measure the edges of their pupils."""
     images = load_labelled(folder, options.gamma, eye_error_mm=options.eye_error_mm, pupil_class=options.pupil_class)
     if options.quick:
         chosen_rows = balanced([i.conditions for i in images], [i.subject or i.name for i in images])

@@ -1,4 +1,4 @@
-"""What was found in one dataset."""
+"""Findings of one dataset."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LISTED = 100  # images of each kind of fault in the JSON
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """What was found in one dataset."""
+    """Findings of one dataset."""
 
     contents: Contents  # what was read
     splits: dict[str, tuple[int, set[int]]]  # split -> number of images and set of subjects

@@ -81,7 +81,7 @@ def outliers(values: Reals, names: Sequence[str], count: int = SHOWN) -> list[Ou
 
 
 def tails(values: Reals) -> Reals:
-    """How far each number lies beyond the middle of its column, (n, m); 0 within it, and where there is no number."""
+    """Compute how far each number lies beyond the middle of its column, (n, m); 0 within it or without a number."""
     low, middle, high = np.nanquantile(values, (0.01, 0.5, 0.99), axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         above = (values - high) / (high - middle)
@@ -97,7 +97,7 @@ def tails(values: Reals) -> Reals:
 
 
 def surprises(values: Reals) -> tuple[Reals, Reals]:
-    """How far each number lies from what the others of its row let one expect, (n, m), and what that is, (n, m)."""
+    """Compute how far each number is from its prediction by the rest of its row, and that prediction; both (n, m)."""
     ranked = np.stack([scores(column).astype(values.dtype) for column in values.T], axis=1)
     n = len(ranked)
     nothing = np.zeros_like(values), np.full_like(values, np.nan)

@@ -1,4 +1,4 @@
-"""What the pixels of an image say: figures of levels, a thumbnail, and what contradicts the window or the labels."""
+"""Measurements on the pixels of an image: grey levels, a thumbnail, contradictions to the window or the labels."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOSTLY, _LEAST_CONTRAST = 0.5, 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureSummary:
-    """What is kept of a picture."""
+    """Measurements on one picture."""
 
     numbers: dict[str, float]  # figures by name
     thumbnail: Bytes  # (SIDE, SIDE) mean levels, 0 to 255

@@ -29,7 +29,7 @@ _CHUNK = 128  # images of a task; packed lines are read in blocks of 32
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Row:
-    """What a process returns of one image."""
+    """Result of reading one image in a worker process."""
 
     row: int
     name: str = ""
@@ -45,7 +45,7 @@ class _Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """What was read of a dataset; arrays have one value per image that was read."""
+    """Data read from a dataset; arrays have one value per image."""
 
     folder: ImageFolder  # the dataset
     rows: Ints  # (n,) rows of the folder's entries

@@ -185,7 +185,7 @@ class Setup:
         return replace(self, scene=self.scene.replaced(SceneSpec.from_mapping(data)))
 
     def with_camera_at(self, camera: int, position_mm: ArrayLike) -> Self:
-        """Move a camera. A camera with a target point keeps looking at it; others keep their direction."""
+        """Move a camera. A camera with a target point keeps looking at it; any other keeps its direction."""
         spec = self.scene.spec.rig.cameras[camera]
         # For a camera with a mirror, the numeric position is that of the mirror image.
         place = np.round(np.asarray(position_mm if spec.mirror is None else spec.mirror.image_of(position_mm)), 6)

@@ -25,7 +25,7 @@ def write(
     ratios: Mapping[str, float | None] | None,
     test: Mapping[str, Separability | None] | None = None,
 ) -> None:
-    """Write the page of folders."""
+    """Write the HTML page that compares the folders."""
     title = "How real the pictures look" if len(found) == 1 else f"{len(found)} folders of pictures compared"
     sections = [Section("Figures", _spread(found) if len(found) == 2 else None, _table(found, ratios))]
     if test is not None:

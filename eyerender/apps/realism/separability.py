@@ -121,7 +121,7 @@ _REVEALING = 8
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Separability:
-    """How well patches of one kind from two folders can be told apart."""
+    """Separability of the patches of one kind from two folders."""
 
     images: tuple[int, int]  # number of images of both folders
     auc: float  # area under the ROC curve over images
@@ -145,7 +145,7 @@ def separability(one: FolderFigures, other: FolderFigures, seed: int = 0) -> dic
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut:
-    """How well a folder is told from a camera that the classifier never saw, and how well a camera from the others."""
+    """Separability of a folder from a camera that the classifier never saw, and of one camera from the remaining ones."""
 
     cameras: int  # number of cameras with enough images
     auc: float  # mean area under the ROC curve of the first folder over the cameras that were left out

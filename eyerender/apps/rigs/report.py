@@ -329,7 +329,7 @@ def _answer(data: dict[str, Any]) -> str:
 
 
 def _cost_section(data: dict[str, Any]) -> Section:
-    """What costs how much, in one table: noise, tolerances, and what estimators assume wrongly."""
+    """Write one table of the costs of noise, of tolerances, and of wrong assumptions of estimators."""
     people = str(data["people"])
     rows = [
         ["noise between frames", degrees_text(data["frame_to_frame_deg"]["median"]), people],

@@ -1,4 +1,4 @@
-"""What glasses do to a tracker: people with and without lenses, every estimator, three ways of calibration.
+"""Effect of glasses on a tracker: people with and without lenses, every estimator, three ways of calibration.
 
 A person sits before a screen with a lamp at each corner, two cameras below it and a lamp at the first of them. All
 lenses sit in the same frame on the same person, so differences are paired by person. Estimators are calibrated on nine

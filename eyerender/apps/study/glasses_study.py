@@ -89,7 +89,7 @@ class _People:
 
 
 class GlassesStudy(Study):
-    """What glasses do to features, to loss and to every estimator."""
+    """Effect of glasses on features, on loss and on every estimator."""
 
     title = "Glasses before an eye tracker"
     about = (

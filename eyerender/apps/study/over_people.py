@@ -29,7 +29,7 @@ Groups = Mapping[tuple[str, str], Mapping[str, Floats]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """What an experiment found: its mean, and the 95 % interval of it if people's own values were published."""
+    """Result of an experiment: its mean, and the 95 % interval where the values of its participants were published."""
 
     mean_deg: float
     low_deg: float | None = None

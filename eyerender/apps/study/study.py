@@ -56,7 +56,7 @@ _PUPIL_MM = 4.0  # diameter of a person's pupil where the scene states none
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyPlan:
-    """What a run of a study observes; `people` are choices of a population (preset, seed, subject).
+    """Subjects of a run of a study; `people` are choices of a population (preset, seed, subject).
 
     `folder` is for the pictures of the run.
     """

@@ -158,7 +158,7 @@ class Item:
         return bool(self.line["labels"][part]["visible"]["pixels"] > 0)
 
     def glints(self) -> list[tuple[int, float, float, bool]]:
-        """Return (light, x, y, visible) of each reflection: of the lamp's centre, or else of the part that has one."""
+        """Return (light, x, y, visible) of each reflection: of the lamp's centre, or of a part with one."""
         x0, y0 = self.entry.window[:2]
         placed = [(g, g["xy_px"] or g["spot_xy_px"]) for g in self.line["labels"]["glints"]]
         return [(g["light"], at[0] - x0, at[1] - y0, g["visible"]) for g, at in placed if at is not None]
@@ -332,7 +332,7 @@ def wrong_labels(error: Exception, place: LinePlace) -> InputError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Surveyed:
-    """What must be known of an image before the first one is written."""
+    """Facts on an image that an export needs before it writes the first one."""
 
     sample: int
     is_of_sample: bool

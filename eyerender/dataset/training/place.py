@@ -73,7 +73,7 @@ def _tangential(camera: Mapping[str, Any]) -> list[int]:
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Where a picture goes on a canvas: x' = s Q x + d, in px with pixel centres at integers."""
+    """Placement of a picture on a canvas: x' = s Q x + d, in px with pixel centres at integers."""
 
     scale: float  # s
     turn_rad: float  # angle of Q, from +x towards +y (clockwise on the screen)

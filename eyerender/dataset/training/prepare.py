@@ -17,7 +17,7 @@ from .place import Placement, mirrored, placed
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
-    """What becomes of each picture.
+    """Options of preparing each picture.
 
     Raises:
         InputError: no part is named, one is unknown, or a value is out of range.
@@ -53,7 +53,7 @@ class Preparation:
 
     @property
     def reads_labels(self) -> bool:
-        """Whether more of a line is needed than what finds its pictures."""
+        """Whether labels of a line are needed, not only the names of its pictures."""
         return self.flags or not set(self.parts) <= PICTURES.keys()
 
     def read(self, line: Mapping[str, Any], picture: PixelsOf, where: str) -> TrainingItem:

@@ -356,7 +356,7 @@ class BlobInterior:
     error_dn: float  # its standard error; infinite if the ellipse is too small
     spread_dn: float  # scatter of the grey levels beyond the image's noise
     covered: float  # share of the inner half that glints covered
-    spot_dn: float  # how much darker than the median the darkest pixels of the inner half are, but for SPECKS of them
+    spot_dn: float  # how much darker than the median the darkest pixels of the inner half are, without SPECKS of them
 
 
 def inspect_interior(inpainted: Inpainted, ellipse: Ellipse, blur_px: float, noise_dn: float) -> BlobInterior:

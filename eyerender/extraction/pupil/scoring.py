@@ -81,9 +81,9 @@ def _along(
         levels: level of the pupil, and level below which others are dark, DN.
 
     Returns:
-        Sectors without points that are dark on both sides; other points outside and inside the ellipse; sectors with
-        points whose outside is shaded, and whose inside is not dark; those without points that have an edge on a bright
-        inside. The median step of the sectors with points decides what is dark there.
+        Numbers of: sectors without points that are dark on both sides; other points outside the ellipse, and inside it;
+        sectors with points that are shaded outside, and that are not dark inside; sectors without points that have an
+        edge on a bright inside. The median step of the sectors with points decides what is dark there.
     """
     pupil, dark = levels
     inside = levels_beside(ellipse, -away[0], linear, corner, patch)

@@ -45,7 +45,7 @@ _SHEET = np.array([CARUNCLE, UPPER_LID, LOWER_LID, SKIN], dtype=np.uint8)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Geometry(ArrayValue):
-    """What the centres of pixels show; NaN where there is none, None where a kind was not requested."""
+    """Geometry at the centres of pixels; NaN where there is none, None where a kind was not requested."""
 
     # (height, width) mm along the camera's axis to the first surface but spectacle lenses; along the ray of a fisheye
     depth: Singles | None

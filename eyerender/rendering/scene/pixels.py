@@ -1,4 +1,4 @@
-"""What a region's projection tells: skin-only tiles, pixels at thin hairs and menisci, and where the lid margins are.
+"""Results of projecting a region: skin-only tiles, pixels at thin hairs and menisci, and where the lid margins are.
 
 The skin is a sheet with a hole, the fissure, that ends at a border. A ray whose pixel lies inside the border's outline
 but outside the hole's outline crosses the sheet, because the number of crossings is the difference of the two winding

@@ -80,7 +80,7 @@ def table_course(table: GazeTable, times_s: Floats, head_mm: Floats, aim: Aiming
 
 @dataclass(frozen=True, slots=True)
 class Looking:
-    """Who looks: what aims an eye, the person's habits, and what moves targets with the rig, if it moves."""
+    """The observer of a sequence: aiming of an eye, the person's habits, and motion of targets with the rig."""
 
     aim: Aiming
     habits: Habits
@@ -158,7 +158,7 @@ def _without_repeats(size: int, count: int, rng: np.random.Generator) -> Ints:
 
 @dataclass(frozen=True, slots=True)
 class _Wanted:
-    """What eyes look at (n, 3) mm, with the head at (n, 3) mm and a torsion (n,) rad beyond Listing's."""
+    """Points that eyes look at (n, 3) mm, places of the head (n, 3) mm, and torsion (n,) rad beyond Listing's."""
 
     target_mm: Floats
     head_mm: Floats

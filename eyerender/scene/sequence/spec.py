@@ -175,7 +175,7 @@ class GazeModel(Spec):
         listed = self.targets or self.screen_mm or self.grid
         for name in ("field_deg", "distance_mm") if listed else ():
             if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{name}: is of drawn targets, and cannot stand beside listed ones")
+                raise ValueError(f"{name}: is of drawn targets, and cannot be combined with listed ones")
         return self
 
     def torsion_at(self, times_s: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""What a sequence is at some times."""
+"""State of a sequence at some times."""
 
 from __future__ import annotations
 
