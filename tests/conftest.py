@@ -59,14 +59,22 @@ def pytest_configure(config: pytest.Config) -> None:
         core._Z19jit_llvm_set_targetPKcS0_j(b"haswell", None, 8)  # no binding in Python
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is not quick where only quick tests are asked for; put files with the longest proofs first."""
+    """Leave out what is not quick where only quick tests are asked for; put the files that take longest first.
+
+    Files with the longest proofs come first, then those with the most tests that are not quick. The many files of quick
+    tests come last, so that all processes end at about the same time. Only tests that will run count: this hook comes
+    after the choice by marks.
+    """
+    is_quick = Quick(listed())
     if config.getoption("--fast"):
-        is_quick = Quick(listed())
         config.hook.pytest_deselected(items=[item for item in items if not is_quick(item)])
         items[:] = [item for item in items if is_quick(item)]
     longest_s: Counter[Path] = Counter()
+    not_quick: Counter[Path] = Counter()
     for item in items:
         allowed = item.get_closest_marker("timeout")
         longest_s[item.path] = max(longest_s[item.path], int(allowed.args[0]) if allowed else 0)
-    items.sort(key=lambda item: -longest_s[item.path])  # the others keep their order
+        not_quick[item.path] += not is_quick(item)
+    items.sort(key=lambda item: (-longest_s[item.path], -not_quick[item.path]))  # the others keep their order

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Ints, Objects
+from ..base.arrays import Bools, Floats, Objects
 from ..scene.events import MOVING, has_event
 from ..scene.observation import Observations
 from .rays import is_none
@@ -87,25 +87,30 @@ def _terms(angles: Floats, *, quadratic: bool) -> Floats:
 def _trimmed_misses(design: Floats, places: Floats, trimmed: int) -> Floats:
     """Return the distances (n,) px from the polynomial with the least sum of its `trimmed` smallest squared ones."""
     rng = np.random.default_rng(0)
-    size = design.shape[1] + 1
-    best, least = np.zeros(len(places)), np.inf
-    for _ in range(_STARTS):
-        misses = _misses(design, places, rng.choice(len(places), size, replace=False))
-        for _ in range(_STEPS):
-            rows = _nearest(misses, trimmed)
-            misses = _misses(design, places, rows)
-        total = float((misses[rows] ** 2).sum())
-        if total < least:
-            best, least = misses, total
-    return best
+    rows = np.zeros((_STARTS, len(places)), dtype=bool)
+    for start in rows:
+        start[rng.choice(len(places), design.shape[1] + 1, replace=False)] = True
+    misses = _misses(design, places, rows)
+    for _ in range(_STEPS):
+        rows = _nearest(misses, trimmed)
+        misses = _misses(design, places, rows)
+    return np.asarray(misses[np.argmin((misses**2).sum(axis=1, where=rows))])
 
 
 def _nearest(misses: Floats, count: int) -> Bools:
-    """Return which of the distances (n,) are among the `count` smallest."""
-    return np.asarray(misses <= np.partition(misses, count - 1)[count - 1])
+    """Return which of the distances (..., n) are among the `count` smallest."""
+    return np.asarray(misses <= np.partition(misses, count - 1)[..., count - 1, None])
 
 
-def _misses(design: Floats, places: Floats, rows: Ints | Bools) -> Floats:
-    """Return the distances (n,) of all places from the least-squares polynomial of some rows."""
-    solution = np.linalg.lstsq(design[rows], places[rows], rcond=None)[0]
-    return np.asarray(np.hypot(*(places - design @ solution).T))
+def _misses(design: Floats, places: Floats, rows: Bools) -> Floats:
+    """Return the distances (starts, n) of all places from the least-squares polynomial of each start's rows (starts, n).
+
+    The terms are of order one, so the normal equations serve. A slight ridge is for starts that do not determine them.
+    """
+    terms = design.shape[1]
+    squares = (design[:, :, None] * design[:, None, :]).reshape(-1, terms**2)
+    products = (design[:, :, None] * places[:, None, :]).reshape(-1, terms * 2)
+    chosen = rows.astype(float)
+    normal = (chosen @ squares).reshape(-1, terms, terms) + 1e-12 * len(places) * np.eye(terms)
+    off = places - design @ np.linalg.solve(normal, (chosen @ products).reshape(-1, terms, 2))
+    return np.asarray(np.hypot(off[..., 0], off[..., 1]))

@@ -26,6 +26,7 @@ def spec(**changes):
     for camera in scene["rig"]["cameras"]:
         camera["frame_rate_hz"] = 50.0
     scene["rig"]["lights"] = scene["rig"]["lights"][:1]
+    scene["sensor"]["exposure_ms"] = 1.0  # few moments of motion blur
     scene |= {
         "image": {"spp": 1, "window_px": [48, 40]},
         "region": None,

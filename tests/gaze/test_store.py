@@ -306,6 +306,15 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
     assert not (tmp_path / "c.json").exists()
 
 
+@pytest.fixture(scope="module")
+def calibration(guestrin, tmp_path_factory):
+    """The text of a file of a regression."""
+    path = tmp_path_factory.mktemp("calibration") / "c.json"
+    seen, rig = load_observations(guestrin)
+    save_estimator(path, fit_estimator(choose_estimator("regression"), seen, rig)[0])
+    return path.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
@@ -322,11 +331,8 @@ def test_bad_input(guestrin, tmp_path, monkeypatch, capsys, argv, words):
         ("eyes.left.b", None, "eyes.left.b: must be a list"),
     ],
 )
-def test_a_calibration_of_another_shape_is_refused(guestrin, tmp_path, path, value, words):
-    seen, rig = load_observations(guestrin)
-    estimator = choose_estimator("regression")
-    save_estimator(tmp_path / "c.json", fit_estimator(estimator, seen, rig)[0])
-    data = json.loads((tmp_path / "c.json").read_text())
+def test_a_calibration_of_another_shape_is_refused(calibration, tmp_path, path, value, words):
+    data = json.loads(calibration)
     *parents, last = path.split(".")
     node = data
     for key in parents:

@@ -282,8 +282,9 @@ def test_a_folder_whose_split_chooses_the_camera_is_named(tmp_path):
     assert ("split train", "camera 1") in pairs
 
 
-RECIPES = ("people_openeds", "bench_world", "dataset_quick")
+RECIPES = ("people_openeds", "dataset_quick")
 MORE = (
+    "bench_world",
     "people_nvgaze",
     "people_pupil_core",
     "people_eyelink",

@@ -134,7 +134,9 @@ def test_a_bundle_of_rays_finds_the_same_images_and_misses_the_same(name, order)
 
 
 @pytest.mark.parametrize("kind", ["remote", "head"])
-@pytest.mark.parametrize(("name", "order"), [("E3", 3), ("E4", 3), ("E4", 4), ("E5", 2), ("E5", 3)])
+@pytest.mark.parametrize(
+    ("name", "order"), [pytest.param("E3", 3, marks=pytest.mark.slow), ("E4", 3), ("E4", 4), ("E5", 2), ("E5", 3)]
+)
 def test_the_optical_length_is_stationary(name, order, kind):
     """Moving any one point of the course over its surface changes the length in second order only."""
     eye = built(name)
@@ -168,15 +170,18 @@ def test_the_optical_length_is_stationary(name, order, kind):
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        *((name, kind) for name in ("E3", "E4") for kind in ("remote", "head")),
+        ("E4", "remote"),
+        ("E4", "head"),
         ("E5", "remote"),
+        pytest.param("E3", "remote", marks=pytest.mark.slow),
+        pytest.param("E3", "head", marks=pytest.mark.slow),
         pytest.param("E5", "head", marks=pytest.mark.slow),
     ],
 )
 def test_every_rig_gets_an_answer_and_the_same_one_backwards(name, kind):
     """Light that runs backwards takes the same way: source and viewpoint exchanged, the gradient lens included."""
     # A ray through the gradient lens of E5 takes a hundred times as long as one through shells.
-    eye, count = built(name), 30 if name == "E5" else 60
+    eye, count = built(name), 12 if name == "E5" else 60
     source, view = rigs(kind, count, seed=1)
     for order in (2, 3, 4):
         found, back = (images(eye, order, *pair, rim=5.85) for pair in ((source, view), (view, source)))

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ...base.arrays import Bools, Floats, Ints, take_rows
 from .habits import Habits
@@ -218,6 +217,8 @@ def _drift(model: GazeModel, number: Ints, habits: Habits, rng: np.random.Genera
 
     Its velocity is an Ornstein-Uhlenbeck process, whose integral diffuses by 2 D t along each axis.
     """
+    from scipy.signal import lfilter  # its import takes a second, and every scene imports this module
+
     kept = np.exp(-STEP_S / _CORRELATED_S)
     size = np.radians(np.sqrt(model.drift_arcmin2_s * habits.drift / _CORRELATED_S) / 60.0)
     white = rng.standard_normal((len(number), 2, 2))

@@ -17,7 +17,6 @@ it is constant (chosen).
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import cont2discrete, lfilter
 from scipy.special import betainc
 
 from ...base.arrays import Floats
@@ -60,6 +59,8 @@ def oscillation_mm(drive_rad: Floats, step_s: float, frequency_hz: float, dampin
 
     Its response to g theta is that of -s^2 / (s^2 + 2 z w s + w^2), discretised by the bilinear rule.
     """
+    from scipy.signal import cont2discrete, lfilter  # its import takes a second, and every scene imports this module
+
     w = 2 * np.pi * frequency_hz
     numerator, denominator, _ = cont2discrete(
         ([-1.0, 0.0, 0.0], [1.0, 2 * damping * w, w * w]), step_s, method="bilinear"
