@@ -26,8 +26,8 @@ COLUMNS = ("centre_x_px", "centre_y_px", "semi_axis_a_px", "semi_axis_b_px", "an
 def load_film(path: Path, gamma: float | None) -> list[BenchImage]:
     """Return the frames of a video, of the one in a folder, or the images of a folder in the order of their names.
 
-    Numbers in names are ordered by value. A hints.json in the folder of the frames is used. Raises InputError if there are fewer
-    than three frames, or several videos.
+    Numbers in names are ordered by value. A hints.json in the folder of the frames is used. Raises InputError if there
+    are fewer than three frames, or several videos.
     """
     folder = path if path.is_dir() else path.parent
     videos = sorted(p for p in path.iterdir() if is_video(p)) if path.is_dir() else [path]

@@ -145,7 +145,7 @@ def separability(one: FolderFigures, other: FolderFigures, seed: int = 0) -> dic
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut:
-    """Separability of a folder from a camera that the classifier never saw, and of one camera from the remaining ones."""
+    """Separability of a folder from a camera that the classifier never saw, and of one camera from the others."""
 
     cameras: int  # number of cameras with enough images
     auc: float  # mean area under the ROC curve of the first folder over the cameras that were left out

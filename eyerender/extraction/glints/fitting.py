@@ -203,27 +203,31 @@ def _starts(windows: Windows, clip: Bools, start: Floats, width: Floats, height:
 
 
 @inlined
-def profile(low: float, sigma: float) -> tuple[float, float, float]:
-    """Integrate exp(-x^2 / (2 s^2)) over the pixel from `low` to `low` + 1, relative to the centre.
+def profiles(low: float, sigma: float, count: int) -> Floats:
+    """Integrate exp(-x^2 / (2 s^2)) over each of `count` pixels from `low` on, relative to the centre.
 
     Returns:
-        The derivative by the centre, the value, and the derivative by ln s.
+        The derivative by the centre, the value, and the derivative by ln s (count, 3).
     """
-    first, last = low / sigma, (low + 1.0) / sigma
-    tail_first, tail_last = math.exp(-0.5 * first * first), math.exp(-0.5 * last * last)
-    value = sigma * _ROOT_HALF_PI * (math.erf(last * _ROOT_HALF) - math.erf(first * _ROOT_HALF))
-    return tail_first - tail_last, value, value + sigma * (first * tail_first - last * tail_last)
+    out, at = np.empty((count, 3)), low / sigma
+    tail, part = math.exp(-0.5 * at * at), math.erf(at * _ROOT_HALF)
+    for j in range(count):
+        first, tail_first, part_first = at, tail, part
+        at = (low + j + 1.0) / sigma
+        tail, part = math.exp(-0.5 * at * at), math.erf(at * _ROOT_HALF)
+        value = sigma * _ROOT_HALF_PI * (part - part_first)
+        out[j, 0], out[j, 1], out[j, 2] = tail_first - tail, value, value + sigma * (first * tail_first - at * tail)
+    return out
 
 
 @inlined
 def _profiles(theta: Floats, x: float, y: float, half: int) -> tuple[Floats, Floats]:
     """Compute the profiles (2 half + 1, 3) of a spot across the columns and along the rows about a pixel (x, y)."""
-    across, along = np.empty((2 * half + 1, 3)), np.empty((2 * half + 1, 3))
-    wide, high = math.exp(theta[3]), math.exp(theta[4])
-    for j in range(2 * half + 1):
-        across[j, 0], across[j, 1], across[j, 2] = profile(x + j - half - 0.5 - theta[0], wide)
-        along[j, 0], along[j, 1], along[j, 2] = profile(y + j - half - 0.5 - theta[1], high)
-    return across, along
+    low, count = -half - 0.5, 2 * half + 1
+    return (
+        profiles(x + low - theta[0], math.exp(theta[3]), count),
+        profiles(y + low - theta[1], math.exp(theta[4]), count),
+    )
 
 
 @inlined

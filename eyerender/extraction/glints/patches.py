@@ -57,15 +57,25 @@ def measure_patches(prepared: Prepared, ellipse: Ellipse, reach_px: float, fit: 
 def _bright_boxes(crop: Image, clip_dn: float, middle: Floats) -> list[Box]:
     """Boxes of the bright patches nearest to the pupil."""
     boxes: list[Box] = []
-    levels = [min(clip_dn, share * float(crop.max(initial=0.0))) for share, _, _, _ in BRIGHT if crop.size]
-    for level, (_, step, least, most) in zip(levels, BRIGHT, strict=False):
-        part = crop[::step, ::step]
+    top = float(crop.max(initial=0.0))
+    white = min(clip_dn, BRIGHT[-1][0] * top)
+    for share, step, least, most in BRIGHT if crop.size else ():
+        part, level = crop[::step, ::step], min(clip_dn, share * top)
         closed = cv2.morphologyEx((part >= level).view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
-        labels, stats = cv2.connectedComponentsWithStats(closed, connectivity=8)[1:3]
-        white = np.bincount(labels[part >= levels[-1]], minlength=len(stats))
-        chosen = (stats[:, 4] >= least) & ((white < 0.5 * stats[:, 4]) | (level == levels[-1]))
-        found = [(x, x + w - step, y, y + h - step) for x, y, w, h, _ in (step * stats[1:][chosen[1:]]).tolist()]
-        boxes += sorted(found, key=lambda box: math.hypot(box[0] - middle[0], box[2] - middle[1]))[:most]
+        # The labels of connected components take five times as long.
+        outlines, hierarchy = cv2.findContours(closed, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        found = [cv2.boundingRect(one) for i, one in enumerate(outlines) if hierarchy[0, i, 3] < 0]  # no holes
+        found.sort(key=lambda box: math.hypot(step * box[0] - middle[0], step * box[1] - middle[1]))
+        enough = len(boxes) + most
+        for x, y, w, h in found:
+            if w * h < least:
+                continue
+            area = np.count_nonzero(closed[y : y + h, x : x + w])
+            dull = level == white or np.count_nonzero(part[y : y + h, x : x + w] >= white) < 0.5 * area
+            if area >= least and dull:
+                boxes.append((step * x, step * (x + w - 1), step * y, step * (y + h - 1)))
+                if len(boxes) == enough:
+                    break
     return boxes
 
 

@@ -12,7 +12,7 @@ from ...optics.ellipse import Ellipse
 from ..preprocessing import Image, ImagePart, Prepared
 from ..pupil.glare import around
 from .detection import Spots
-from .fitting import LARGEST_PX, SpotFit, profile
+from .fitting import LARGEST_PX, SpotFit, profiles
 
 # In noise standard deviations: the largest residual of a spot whose light is subtracted; the light above which a pixel
 # is left out even so; the faintest light that matters.
@@ -83,13 +83,10 @@ def _subtracted(linear: Image, spots: Floats, radius: Floats, limit: float) -> t
         cx, cy, wide, high, amplitude = spots[k, 0], spots[k, 1], spots[k, 2], spots[k, 3], spots[k, 4]
         x0, x1 = max(0, math.floor(cx - radius[k])), min(width, math.ceil(cx + radius[k]) + 1)
         y0, y1 = max(0, math.floor(cy - radius[k])), min(height, math.ceil(cy + radius[k]) + 1)
-        across = np.empty(max(x1 - x0, 0))
-        for x in range(x0, x1):
-            across[x - x0] = amplitude * profile(x - 0.5 - cx, wide)[1]
+        across, along = profiles(x0 - 0.5 - cx, wide, max(x1 - x0, 0)), profiles(y0 - 0.5 - cy, high, max(y1 - y0, 0))
         for y in range(y0, y1):
-            along = profile(y - 0.5 - cy, high)[1]
             for x in range(x0, x1):
-                light = across[x - x0] * along
+                light = amplitude * across[x - x0, 1] * along[y - y0, 1]
                 out[y, x] -= np.float32(light)
                 bright[y, x] |= light > limit
     return out, bright

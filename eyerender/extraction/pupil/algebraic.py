@@ -115,16 +115,16 @@ def _elliptic_direction(quadratic: tuple[float, ...]) -> tuple[float, float, flo
 
 
 @inlined
-def taubin_fit(points: Floats, out: Floats) -> bool:
-    """Fit Taubin's ellipse to points (n, 2) and write it to out (5,); return False if there is none.
+def taubin_fit(points: Floats, weight: Floats, out: Floats) -> bool:
+    """Fit Taubin's ellipse to points (n, 2) with weights (n,) and write it to out (5,); return False if there is none.
 
     The conic (x^2, x y, y^2, x, y, 1) . v minimises its mean square value over the mean square of its gradient.
     `cv2.fitEllipseAMS` computes the same in single precision. Source: Taubin (1991).
     """
-    mean_x, mean_y, scale = _unit(points)
+    mean_x, mean_y, scale = _unit(points, weight)
     if not scale > 0.0:
         return False
-    mean, scatter, gradient = _scatter(points, mean_x, mean_y, scale)
+    mean, scatter, gradient = _scatter(points, weight, mean_x, mean_y, scale)
     conic = _least_direction(scatter, gradient)
     a, b, c, d, e = conic[0], conic[1], conic[2], conic[3], conic[4]
     f = -(a * mean[0] + b * mean[1] + c * mean[2] + d * mean[3] + e * mean[4])
@@ -168,33 +168,43 @@ def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
 
 
 @inlined
-def _unit(points: Floats) -> tuple[float, float, float]:
-    """Compute the mean of points (n, 2) and their largest offset, for scaling to small numbers about 0."""
-    n, x, y, scale = points.shape[0], 0.0, 0.0, 0.0
-    for i in range(n):
-        x, y = x + points[i, 0] / n, y + points[i, 1] / n
-    for i in range(n):
-        scale = max(scale, abs(points[i, 0] - x), abs(points[i, 1] - y))
+def _unit(points: Floats, weight: Floats) -> tuple[float, float, float]:
+    """Compute the mean of the points (n, 2) that count and their largest offset, for scaling to small numbers about 0."""
+    total = x = y = scale = 0.0
+    for i in range(weight.size):
+        total, x, y = total + weight[i], x + weight[i] * points[i, 0], y + weight[i] * points[i, 1]
+    x, y = x / total, y / total
+    for i in range(weight.size):
+        if weight[i] > 0.0:
+            scale = max(scale, abs(points[i, 0] - x), abs(points[i, 1] - y))
     return x, y, scale
 
 
 @inlined
-def _scatter(points: Floats, mean_x: float, mean_y: float, scale: float) -> tuple[Floats, Floats, Floats]:
+def _scatter(
+    points: Floats, weight: Floats, mean_x: float, mean_y: float, scale: float
+) -> tuple[Floats, Floats, Floats]:
     """Compute mean (5,) and covariance (5, 5) of (x^2, x y, y^2, x, y), scaled points, and gradient products (5, 5)."""
-    n, mean, scatter, gradient = points.shape[0], np.zeros(5), np.zeros((5, 5)), np.zeros((5, 5))
+    total, mean, scatter, gradient = 0.0, np.zeros(5), np.zeros((5, 5)), np.zeros((5, 5))
     z, by_x, by_y = np.empty(5), np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.array([0.0, 0.0, 0.0, 0.0, 1.0])
-    for i in range(n):
-        x, y = (points[i, 0] - mean_x) / scale, (points[i, 1] - mean_y) / scale
+    for i in range(weight.size):
+        if weight[i] <= 0.0:
+            continue
+        x, y, w = (points[i, 0] - mean_x) / scale, (points[i, 1] - mean_y) / scale, weight[i]
         z[0], z[1], z[2], z[3], z[4] = x * x, x * y, y * y, x, y
         by_x[0], by_x[1], by_y[1], by_y[2] = 2.0 * x, y, x, 2.0 * y
+        total += w
         for j in range(5):
-            mean[j] += z[j] / n
+            mean[j] += w * z[j]
             for m in range(5):
-                scatter[j, m] += z[j] * z[m] / n
-                gradient[j, m] += (by_x[j] * by_x[m] + by_y[j] * by_y[m]) / n
+                scatter[j, m] += w * z[j] * z[m]
+                gradient[j, m] += w * (by_x[j] * by_x[m] + by_y[j] * by_y[m])
+    for j in range(5):
+        mean[j] /= total
     for j in range(5):
         for m in range(5):
-            scatter[j, m] -= mean[j] * mean[m]
+            scatter[j, m] = scatter[j, m] / total - mean[j] * mean[m]
+            gradient[j, m] /= total
         gradient[j, j] += 1e-12
     return mean, scatter, gradient
 

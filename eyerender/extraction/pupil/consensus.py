@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats
+from ...base.arrays import Bools, Floats, Indices
 from ...base.jit import compiled, inlined
 from ...optics.ellipse import Ellipse
-from ..products import selected, selected_rows
+from ..products import copy, largest_size, selected, selected_rows
 from ..settings import Shape
 from ..statistics import quantile_of
 from .algebraic import direct_fits, taubin_fit
@@ -23,8 +23,12 @@ from .places import SECTORS, holding, relative_to, sector_at
 PIECES = 16  # arcs are cut at these sectors, to separate a lid margin from the boundary it joins
 SAMPLES = 240
 POINTS_PER_PIECE = 3
-FINALISTS = 24  # random ellipses whose support is counted with all points
+_DRAWS = np.random.default_rng(0).random((SAMPLES, 3 + 3 * POINTS_PER_PIECE))  # the same image gives the same result
+FINALISTS = 6  # random ellipses that are settled
 CUT = 0.08  # share of the outline in a gap that is more than a glint's: a lid, lashes or a reflection cuts the outline
+# In tolerances: the distance up to which an edge point has its full weight, and the one from which on it has none.
+FULL, NONE = 0.3, 1.3
+TURNS, SETTLED_PX = 8, 2e-3  # most fits, and the change of an ellipse that ends them
 ALL_SEEN = 0.9  # share of the outline that no lid or lashes hide
 
 
@@ -33,7 +37,7 @@ class BoundaryFit:
     """An ellipse fitted to edge points, corrected for curvature."""
 
     ellipse: Ellipse  # the ellipse
-    inliers: Bools  # (n,) which edge points it is fitted to
+    inliers: Bools  # (n,) which edge points belong to it
     points_px: Floats  # those points, corrected
     support: float  # share of the outline that they cover
     gap: float  # share of the outline in the longest stretch without points
@@ -76,38 +80,71 @@ def _consensus(edges: EdgePoints, candidate: Candidate, shape: Shape, tolerance:
         count, found, _, _, seen = _settled(points, edges.normals, whole[0], edges.sigma_px, tolerance)
         if count >= 8 and seen[0] > ALL_SEEN and _sane(found[2], found[3], candidate, shape):
             return Ellipse.of(found)
-    fits = np.concatenate([whole, _random_fits(edges, candidate)])
+    (cx, cy) = candidate.ellipse.centre_px.tolist()
+    fits = np.concatenate([whole, _random_fits(points, edges.arcs(), (cx, cy), _DRAWS)])
     with np.errstate(invalid="ignore"):
         fits = fits[_sane(fits[:, 2], fits[:, 3], candidate, shape)]
     if fits.shape[0] == 0:
         return None
-    # Every third point suffices to choose the ellipses that are then scored with all points.
+    # Every third point suffices to choose. A random ellipse passes beside most points, so the order of those that have
+    # not settled is a matter of luck. Source: Chum, Matas and Kittler (2003).
     some, facing = np.ascontiguousarray(points[::3]), np.ascontiguousarray(edges.normals[::3])
-    rough = _support(some, facing, fits, tolerance)
-    fits = fits[np.argsort(-rough, kind="stable")[:FINALISTS]]
-    return Ellipse.of(fits[int(np.argmax(_support(points, edges.normals, fits, tolerance)))])
+    order = np.argsort(-_support(some, facing, fits, tolerance), kind="stable")
+    best, most = fits[order[0]], -math.inf
+    for one in fits[order[:FINALISTS]]:
+        count, found, _, _, seen = _settled(some, facing, one, edges.sigma_px, tolerance)
+        if count >= 8 and _sane(found[2], found[3], candidate, shape):
+            # Logarithm of the likelihood of the inliers, given their own scatter, over that of points anywhere near.
+            likelihood = count * math.log(tolerance / max(float(seen[2]), 0.01))
+            best, most = (found, likelihood) if likelihood > most else (best, most)
+    return Ellipse.of(best)
 
 
-def _random_fits(edges: EdgePoints, candidate: Candidate) -> Floats:
-    """Fit ellipses (m, 5) to the points of random triples of arc pieces."""
-    points = edges.points_px
-    offset = points - candidate.ellipse.centre_px
-    bearing = np.arctan2(offset[:, 1], offset[:, 0])
-    sector = ((bearing / (2.0 * np.pi) + 0.5) * PIECES).astype(np.intp) % PIECES
-    _, piece = np.unique(edges.arcs() * PIECES + sector, return_inverse=True)
-    sizes = np.bincount(piece)
-    usable = np.nonzero(sizes >= 4)[0]
-    if usable.size < 3:
-        return np.zeros((0, 5))
-    rng = np.random.default_rng(0)  # the same image must give the same result
-    order = np.argsort(piece, kind="stable")
-    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    chance = sizes[usable] / sizes[usable].sum()
-    keys = rng.random((SAMPLES, usable.size)) ** (1.0 / chance)[None, :]  # weighted draw without replacement
-    chosen = usable[np.argsort(-keys, axis=1)[:, :3]]
-    at = rng.random((SAMPLES, 3, POINTS_PER_PIECE)) * sizes[chosen][..., None]
-    index = order[first[chosen][..., None] + at.astype(np.intp)].reshape(SAMPLES, -1)
-    return direct_fits(points[index])
+@compiled("f8[:,::1], i8[::1], UniTuple(f8, 2), f8[:,::1]")
+def _random_fits(points: Floats, arcs: Indices, centre: tuple[float, float], draws: Floats) -> Floats:
+    """Fit ellipses (SAMPLES, 5) to points of random triples of arc pieces; NaN where there is none.
+
+    `arcs` (n,) are the labels of the connected pieces that `points` (n, 2) lie on; they are cut in sectors about
+    `centre`. A long piece is drawn more often. `draws` are the random numbers of each sample.
+    """
+    n, number = points.shape[0], np.empty(points.shape[0], dtype=np.int64)
+    size = np.zeros((arcs.max() + 1) * PIECES, dtype=np.int64)
+    for i in range(n):
+        bearing = math.atan2(points[i, 1] - centre[1], points[i, 0] - centre[0])
+        number[i] = arcs[i] * PIECES + int((bearing / (2.0 * math.pi) + 0.5) * PIECES) % PIECES
+        size[number[i]] += 1
+    first, order, place = np.empty(size.size, dtype=np.int64), np.empty(n, dtype=np.int64), 0
+    long, count, total = np.empty(size.size, dtype=np.int64), 0, 0
+    for k in range(size.size):
+        first[k] = place
+        place += size[k]
+        if size[k] >= 4:
+            long[count] = k
+            count, total = count + 1, total + size[k]
+    at = first.copy()
+    for i in range(n):
+        order[at[number[i]]] = i
+        at[number[i]] += 1
+    if count < 3:
+        return np.empty((0, 5))
+    chosen, picked = np.empty((draws.shape[0], 3 * POINTS_PER_PIECE, 2)), np.empty(3, dtype=np.int64)
+    for m in range(draws.shape[0]):
+        left = total
+        for j in range(3):
+            rest, k = draws[m, j] * left, -1
+            for one in range(count):
+                if (j > 0 and long[one] == picked[0]) or (j > 1 and long[one] == picked[1]):
+                    continue
+                k = long[one]
+                rest -= size[k]
+                if rest < 0.0:
+                    break
+            picked[j] = k
+            left -= size[k]
+            for i in range(POINTS_PER_PIECE):
+                draw = draws[m, 3 + POINTS_PER_PIECE * j + i]
+                copy(points[order[first[k] + int(draw * size[k])]], chosen[m, POINTS_PER_PIECE * j + i])
+    return direct_fits(chosen)
 
 
 def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
@@ -186,44 +223,42 @@ def _polished(edges: EdgePoints, start: Ellipse, shape: Shape, tolerance: float,
 def _settled(
     points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float
 ) -> tuple[int, Floats, Bools, Floats, Floats]:
-    """Select points (n, 2) with normals (n, 2) and refit until the selection settles, in compiled code.
+    """Weight points (n, 2) with normals (n, 2) and refit until the ellipse settles, in compiled code.
 
     Edge points are moved outward by the curvature shift: the steepest place of a blurred convex edge, with the whole
-    smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. Selected
-    points lie within `tolerance` px; twice that at first. Returns the number of selected points (fewer than 8: too few;
-    -1: they span no ellipse), the ellipse (5,), which points (n,), the moved points (n, 2), and (3,) support, gap and
+    smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. Points count
+    the less, the farther they are (FULL and NONE; twice that at first): with a limit at which a weight falls to 0 at
+    once, noise would change the ellipse by steps. Returns the number of inliers (fewer than 8: too few; -1: they span
+    no ellipse), the ellipse (5,), which points are inliers (n,), the moved points (n, 2), and (3,) support, gap and
     residual as in `BoundaryFit`.
     """
     n = points.shape[0]
     ellipse, moved, nothing = start.copy(), np.empty((n, 2)), np.zeros(3)
-    distance, chosen, inliers = np.empty(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    for turn in range(5):
-        reach = 2.0 * tolerance if turn == 0 else tolerance
-        count = _select(points, normals, ellipse, sigma_px, reach, moved, distance, chosen)
-        if turn >= 1 and count >= 8:
-            count = _drop_outliers(distance, chosen)
-        if count < 8:
-            return count, ellipse, chosen, moved, nothing
-        same = turn > 1
-        for i in range(n):
-            same = same and chosen[i] == inliers[i]
-            inliers[i] = chosen[i]
-        if not taubin_fit(selected_rows(moved, inliers), ellipse):
-            return -1, ellipse, inliers, moved, nothing
-        if same:
+    distance, weight, inliers = np.empty(n), np.empty(n), np.zeros(n, dtype=np.bool_)
+    for turn in range(TURNS):
+        scale = 2.0 * tolerance if turn == 0 else tolerance
+        if _weigh(points, normals, ellipse, sigma_px, scale, moved, distance, weight) < 8:
             break
+        before = ellipse.copy()
+        if not taubin_fit(moved, weight, ellipse):
+            return -1, ellipse, inliers, moved, nothing
+        if turn > 1 and largest_size(ellipse[:4] - before[:4]) < SETTLED_PX:
+            break
+    count = _find_inliers(distance, weight, tolerance, inliers)
+    if count < 8:
+        return count, ellipse, inliers, moved, nothing
     return count, ellipse, inliers, moved, _seen(ellipse, selected_rows(moved, inliers))
 
 
 @inlined
-def _select(
-    points: Floats, normals: Floats, start: Floats, sigma_px: float, reach: float,
-    moved: Floats, distance: Floats, chosen: Bools,
+def _weigh(
+    points: Floats, normals: Floats, start: Floats, sigma_px: float, tolerance: float,
+    moved: Floats, distance: Floats, weight: Floats,
 ) -> int:  # fmt: skip
-    """Move points by the curvature shift and select those near an ellipse; return the number of selected points.
+    """Move points by the curvature shift and weight those near an ellipse; return the number of those that count.
 
-    The arguments are those of `_settled`, the largest distance of a point, and output arrays: the moved points (n, 2),
-    their distances (n,) and whether they are selected (n,).
+    The arguments are those of `_settled`, and output arrays: the moved points (n, 2), their distances (n,) and weights
+    (n,).
     """
     ellipse, n, count = (start[0], start[1], start[2], start[3], start[4]), points.shape[0], 0
     for i in range(n):
@@ -231,22 +266,26 @@ def _select(
         shift = min(0.5 * sigma_px * sigma_px * curvature, 0.15 * start[3])
         moved[i, 0], moved[i, 1] = points[i, 0] + shift * nx, points[i, 1] + shift * ny
         distance[i] = away + shift
-        chosen[i] = abs(distance[i]) < reach and nx * normals[i, 0] + ny * normals[i, 1] > 0.9
-        count += chosen[i]
+        beyond = max(abs(distance[i]) / tolerance - FULL, 0.0) / (NONE - FULL)
+        near = beyond < 1.0 and nx * normals[i, 0] + ny * normals[i, 1] > 0.9
+        weight[i] = (1.0 - beyond * beyond) ** 2 if near else 0.0
+        count += near
     return count
 
 
 @inlined
-def _drop_outliers(distance: Floats, chosen: Bools) -> int:
-    """Narrow the selection (n,) to points whose distance is near the median; return their number."""
-    some = selected(distance, chosen)
+def _find_inliers(distance: Floats, weight: Floats, tolerance: float, inliers: Bools) -> int:
+    """Write which points (n,) that count lie within the tolerance and are no outliers; return their number."""
+    for i in range(distance.size):
+        inliers[i] = weight[i] > 0.0 and abs(distance[i]) < tolerance
+    some = selected(distance, inliers)
     middle = quantile_of(some, 0.5)
     for i in range(some.size):
         some[i] = abs(some[i] - middle)
     limit, count = max(3.5 * 1.4826 * quantile_of(some, 0.5), 0.1), 0
     for i in range(distance.size):
-        chosen[i] = chosen[i] and abs(distance[i]) < limit
-        count += chosen[i]
+        inliers[i] = inliers[i] and abs(distance[i]) < limit
+        count += inliers[i]
     return count
 
 
