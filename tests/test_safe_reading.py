@@ -35,6 +35,7 @@ EXCEPTIONS = {
     "scene.shipped.is_shipped_dataset: path.read_text": "this package's data",
     "apps.live.page.Tab._build: STYLE.read_text": "this package's data",
     "apps.live.page.Tab.wake: self._studio.painter.open": "no file",
+    "cli.examples: (Path(__file__).parent / 'examples.txt').read_text": "this package's data",
     "cli.live.live.announce: webbrowser.open": "no file",
     "cli.main.run: os.open": "the null device",
     "cli.main._fill_closed_streams: os.open": "the null device",
