@@ -151,7 +151,10 @@ def test_the_command(tmp_path, capsys):
         ("- {part: led, quantity: rotation_deg, sd: 1, when: after}", "a led has position_mm, power_percent"),
         ("- {part: mirror, quantity: position_mm, sd: 1, when: after}", "the rig has no such mirror"),
         ("- {part: led, quantity: position_mm, sd: -1, when: after}", "tolerances.0.sd"),
-        ("- {part: camera, quantity: rotation_deg, sd: 20, when: after}", "must be at most 10 for rotation_deg, not 20"),
+        (
+            "- {part: camera, quantity: rotation_deg, sd: 20, when: after}",
+            "must be at most 10 for rotation_deg, not 20",
+        ),
     ]:
         path.write_text("\n".join([*lines[:2], bad]))
         assert run([*base, "-o", str(tmp_path / "no"), "--tolerances", str(path)]) == 2

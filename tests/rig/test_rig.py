@@ -62,8 +62,12 @@ def test_ring_lies_in_the_nodal_plane_around_the_axis():
 def test_a_ring_about_a_display_lens_lies_across_its_axis():
     """The first LED is where a camera at the centre that looks at the eye has it at the image's right: at +y."""
     own = {"radius_mm": 22, "count": 8, "centre_mm": [16, -31.5, 0]}
+
+    def rig_of(ring):
+        return Rig.from_mapping({"cameras": [CAMERA, CAMERA], "lights": [{"ring": ring}]})
+
     places = {
-        name: np.array([lamp.position_mm for lamp in Rig(cameras=[CAMERA], lights=[{"ring": ring}]).build().lights])
+        name: np.array([lamp.position_mm for lamp in rig_of(ring).build().lights])
         for name, ring in {"plain": own, "turned": {**own, "axis": [0.5, 0, -0.1], "phase_deg": 90}}.items()
     }
     angle = np.pi / 4 * np.arange(8)
@@ -76,9 +80,9 @@ def test_a_ring_about_a_display_lens_lies_across_its_axis():
     assert offsets[0, 2] < -21
     for change, reason in (({"camera": 1}, "either camera or"), ({"axis": [0, 0, 0]}, "must not be zero")):
         with pytest.raises(InputError, match=reason):
-            Rig(cameras=[CAMERA, CAMERA], lights=[{"ring": {**own, **change}}])
+            rig_of({**own, **change})
     with pytest.raises(InputError, match="axis is that of a ring with centre_mm"):
-        Rig(cameras=[CAMERA], lights=[{"ring": {"radius_mm": 22, "count": 8, "axis": [1, 0, 0]}}])
+        rig_of({"radius_mm": 22, "count": 8, "axis": [1, 0, 0]})
 
 
 def test_light_axis_points_at_its_aim():
