@@ -165,6 +165,6 @@ def test_fine_grain_is_shifted_from_person_to_person():
     assert np.array_equal(one, same)
     spectrum = np.fft.rfft2(one - one.mean()).conj() * np.fft.rfft2(other - other.mean())
     match = np.fft.irfft2(spectrum / np.maximum(np.abs(spectrum), 1e-9), s=one.shape)
-    shift = np.unravel_index(np.argmax(match), match.shape)
-    assert shift != (0, 0)
+    shift = divmod(int(np.argmax(match)), match.shape[1])
+    assert any(shift)
     np.testing.assert_array_equal(np.roll(one, shift, axis=(0, 1)), other)
