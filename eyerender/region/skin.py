@@ -92,7 +92,7 @@ def skin_map(spec: Region, grain: int = 1) -> Singles:
     """
     reference = spec.with_lids(_REFERENCE_BLINK)
     rest = sheet(reference, Globe.sphere()).vertices
-    rows, columns = ((np.arange(n // grain) + 0.5) * grain - 0.5 for n in (SHEET_ROWS, _COLUMNS))
+    rows, columns = (np.asarray((np.arange(n // grain) + 0.5) * grain - 0.5) for n in (SHEET_ROWS, _COLUMNS))
     rows, columns = sheet_place(rows), columns * (rest.shape[1] / _COLUMNS)
     out = np.zeros(((SHEET_ROWS + BANDS) // grain, len(columns), 4), np.float32)
     if spec.skin.map == "off":

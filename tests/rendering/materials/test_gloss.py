@@ -33,7 +33,7 @@ def test_masks_mark_where_mirrored_light_exceeds_half_of_the_scattered(renderer,
     forget()
     matte = Renderer(renderer.backend).radiance(job, spp=64)
     ratio = (shiny - matte) / matte
-    assert 5 < marked.sum() < 0.05 * marked.size
+    assert 3 < marked.sum() < 0.05 * marked.size
     # Mask and picture take other samples of a pixel, which matters on relief and hairs that are finer than a pixel.
     assert np.mean(ratio[marked] > 0.25) > 0.75
     assert np.mean(ratio[~marked & (part < 2)] < 0.75) > 0.995
