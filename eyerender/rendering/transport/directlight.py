@@ -17,6 +17,9 @@ from ..records.recording import syntax
 from ..records.surfaces import DeviceSurface
 from .manifold import LampConnection, Target, connect
 
+_AIMINGS = 3
+_BEFORE_LENSES_MM = 80.0  # farther from the eye than all lenses
+
 
 def lamp_blocked(
     frame: DeviceFrame, x: mi.Vector3f, lamp: mi.Vector3f, sphere: mi.Bool, cornea: mi.Bool, active: mi.Bool
@@ -275,6 +278,23 @@ class LampPath:
         )  # fmt: skip
 
 
+def _aim_through(lenses: tuple[DeviceSurface, ...], source: mi.Vector3f, aim: mi.Vector3f) -> mi.Vector3f:
+    """Shift points so that rays from a lamp towards them pass the points themselves behind the lenses.
+
+    Newton's method must not start beside the cornea, which oblique lamps' rays towards the points themselves may miss.
+    """
+    towards = aim
+    for _ in range(_AIMINGS):
+        w = dr.normalize(towards - source)
+        y, ok = source + dr.maximum(dr.dot(aim - source, w) - _BEFORE_LENSES_MM, 0) * w, mi.Bool(True)
+        for surface in lenses:
+            y, w, _, good = surface.refract(y, w)
+            ok &= good
+        passed = y + dr.dot(aim - y, w) * w
+        towards = dr.select(ok, towards + aim - passed, towards)
+    return towards
+
+
 def _through_lenses(
     frame: DeviceFrame,
     lamp: DeviceLamp,
@@ -292,8 +312,9 @@ def _through_lenses(
     source, target, chain = ends
     lenses = tuple(surface for lens in frame.turned_lenses for surface in (lens.front, lens.back))
     some = active if beside is None else active & (lamp.through > 0.5)
+    aimed = replace(target, aim=_aim_through(lenses, source, target.aim))
     path = connect(
-        (*lenses, *chain), source, target, frame.turned_lenses[0].half[0], some, ahead_mm=ahead_mm, lensed=True
+        (*lenses, *chain), source, aimed, frame.turned_lenses[0].half[0], some, ahead_mm=ahead_mm, lensed=True
     )
     y, w, gain, ok = path.entry - path.leaving, path.leaving, mi.Float(1), mi.Bool(True)
     for lens in frame.turned_lenses:
