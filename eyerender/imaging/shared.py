@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from ..rendering.records.job import RenderJob
     from ..rig.camera import Window
 
-LIDS_PX = 0.5
-"""Largest motion of lids between meshes that moments share: that between moments; each takes the nearer one."""
-_POSED_PX = 2.0  # largest motion of lids between poses, which are joined by straight lines
+LIDS_PX = 0.25
+"""Largest motion of lids between meshes that moments share: half of that between moments; each takes the nearer one."""
+_POSED_PX = 1.0  # largest motion of lids between poses, which are joined by straight lines
 _STILL_PX = 0.25  # motion from the middle of an exposure: as far as each moment may be from the truth
 _REACH_MM = 14.0  # from the globe's centre: no part of an eye is farther
 _AROUND_MM = 30.0  # places beside the eye, where a view that moves is noticed

@@ -24,6 +24,13 @@ def write(folder, name, text):
     return {"file": name}
 
 
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    plain, marked = (write(tmp_path, name, mark + GAZE) for name, mark in (("a.csv", ""), ("b.csv", "\ufeff")))
+    keys = {"columns": {"time_s": "time_ms", "azimuth_deg": "x", "elevation_deg": "y"}, "unit_s": 1e-3}
+    a, b = (Sequence.from_mapping({"gaze": {**file, **keys}}).resolved(tmp_path) for file in (plain, marked))
+    assert a == b
+
+
 def test_files_give_the_same_states_as_tables(tmp_path):
     columns = {"time_s": "time_ms", "azimuth_deg": "x", "elevation_deg": "y"}
     gaze = {**write(tmp_path, "gaze.csv", GAZE), "columns": columns, "unit_s": 1e-3}
@@ -57,6 +64,8 @@ def test_targets_of_a_file_are_fixated(tmp_path):
     ("text", "says"),
     [
         ("time,azimuth_deg\n0,1\n", "has no column time_s"),
+        ("time_s;azimuth_deg;elevation_deg\n0;1;2\n", "separated by ';', not by commas"),
+        ("time_s,azimuth_deg,elevation_deg\n15,1,2\n16,1,2\n", "15 to 16 s is outside the sequence"),
         ("time_s,azimuth_deg\n0,1\n", "give either azimuth_deg and elevation_deg, or target_mm"),
         ("time_s,azimuth_deg,elevation_deg\n0,a,0\n", "'a' is not a number"),
         ("time_s,azimuth_deg,elevation_deg\n0,1e12,0\n", "'1e12' is not a number"),
@@ -81,7 +90,8 @@ def test_files_of_too_many_rows_and_unknown_columns_are_refused(tmp_path):
 
 
 def test_frames_are_taken_and_stamped_at_times_of_ones_own(tmp_path):
-    stamps = 1234.5 + np.array([0.0, 0.01, 0.02, 0.05, 0.0601])  # two frames are missing
+    # Two frames are missing; the clock counts from 1970.
+    stamps = 1.7e9 + np.array([0.0, 0.01, 0.02, 0.05, 0.0601])
     np.save(tmp_path / "eye0_timestamps.npy", stamps)
     times = {"file": str(tmp_path / "eye0_timestamps.npy")}
     index = in_time(sequence=turning(100.0, -5.0, 0.1, timestamps=times)).frames().index

@@ -339,15 +339,20 @@ def read_table(
 ) -> Iterator[dict[str, str]]:
     """Yield the rows of a CSV file with a header as mappings; a short row has only its first columns.
 
+    A byte order mark, as spreadsheets write it, is skipped.
+
     Raises:
         InputError: as `read_text`; the file is not valid CSV, lacks one of `columns`, or a row is too long.
     """
     source = str(path)
-    reader = csv.reader(io.StringIO(read_text(path, limit=limit, follow=follow), newline=""))
+    text = read_text(path, limit=limit, follow=follow).removeprefix("\ufeff")
+    reader = csv.reader(io.StringIO(text, newline=""))
     try:
         header = next(reader, [])
         for name in sorted(set(columns) - set(header)):
-            raise InputError(f"has no column {name}", source=source)
+            apart = next((sign for sign in ";\t" if len(header) == 1 and sign in header[0]), "")
+            hint = f"; its cells are separated by {apart!r}, not by commas" if apart else ""
+            raise InputError(f"has no column {name}{hint}", source=source)
         for row in filter(None, reader):
             if len(row) > len(header):
                 reason = f"has {len(row)} cells; the header has {len(header)}"

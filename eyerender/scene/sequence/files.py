@@ -19,16 +19,21 @@ from ...base.storage.files import read_table, shown
 
 MAX_ROWS = 20_000
 """Most rows of a table: 20 s at 1,000 Hz."""
+LATEST_S = 1e10
+"""Latest time that a camera may store, s: clocks that count from 1970 are at 1.7e9."""
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "."))
 
 
-def read_columns(path: Path, names: Mapping[str, str], needed: tuple[str, ...]) -> dict[str, Floats]:
+def read_columns(
+    path: Path, names: Mapping[str, str], needed: tuple[str, ...], *, largest: float = LARGEST
+) -> dict[str, Floats]:
     """Read columns of a CSV table; rows in which one of them is missing are left out.
 
     Args:
         path: the file.
         names: what each column is called in the file.
         needed: the columns that the file must have; of the others, it may have any.
+        largest: the largest magnitude of a number.
 
     Raises:
         InputError: the file cannot be read, lacks a column, has too many rows, or a cell is no number.
@@ -40,7 +45,7 @@ def read_columns(path: Path, names: Mapping[str, str], needed: tuple[str, ...]) 
     kept = [row for row in rows if all(row.get(names[key], "").strip().lower() not in _MISSING for key in given)]
     if not kept:
         raise InputError("has no row in which all columns have values", source=str(path))
-    return {key: np.array([_number(row[names[key]], names[key], path) for row in kept]) for key in given}
+    return {key: np.array([_number(row[names[key]], names[key], path, largest) for row in kept]) for key in given}
 
 
 def read_times(path: Path) -> Floats:
@@ -50,21 +55,21 @@ def read_times(path: Path) -> Floats:
         InputError: the file cannot be read or holds too many times, or they are not finite.
     """
     if path.suffix.lower() != ".npy":
-        return read_columns(path, {"time_s": "time_s"}, ("time_s",))["time_s"]
+        return read_columns(path, {"time_s": "time_s"}, ("time_s",), largest=LATEST_S)["time_s"]
     found = mapped_array(path)
     if found.ndim != 1 or found.dtype.kind not in "iuf" or not 0 < len(found) <= MAX_ROWS:
         raise InputError(f"must be a list of 1 to {MAX_ROWS} times", source=str(path))
     times = np.array(found, dtype=np.float64)
-    if not np.all(np.abs(times) <= LARGEST):
-        raise InputError(f"has a time that is not between -{LARGEST:g} and {LARGEST:g}", source=str(path))
+    if not np.all(np.abs(times) <= LATEST_S):
+        raise InputError(f"has a time that is not between -{LATEST_S:g} and {LATEST_S:g} s", source=str(path))
     return times
 
 
-def _number(cell: str, name: str, path: Path) -> float:
+def _number(cell: str, name: str, path: Path, largest: float) -> float:
     try:
         value = float(cell)
     except ValueError:
         value = np.nan
-    if not abs(value) <= LARGEST:
-        raise InputError(f"{shown(cell)} is not a number up to {LARGEST:g}", source=str(path), path=name)
+    if not abs(value) <= largest:
+        raise InputError(f"{shown(cell)} is not a number up to {largest:g}", source=str(path), path=name)
     return value

@@ -13,10 +13,11 @@ from ...base.arrays import Bools, Floats, Ints
 from ...base.errors import InputError
 from ...base.spec import NonNegative, Number, Positive, Spec, Vec2, Vec3
 from ...rig.screen import ScreenPlane
-from .files import MAX_ROWS, read_columns, read_times
+from .files import LATEST_S, MAX_ROWS, read_columns, read_times
 
 Closure = Annotated[float, Field(ge=0, le=1)]
 Times = Annotated[tuple[Number, ...], Field(min_length=1, max_length=MAX_ROWS)]
+_StoredTime = Annotated[float, Field(ge=-LATEST_S, le=LATEST_S)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
 Aiming = Callable[[Floats, Floats, Floats, int], tuple[Floats, Floats]]
 """Turns an eye (0 right, 1 left) with a torsion (k,) rad beyond Listing's towards targets (k, 3) mm with the head at
@@ -297,7 +298,7 @@ class Timestamps(Spec):
         default=0.0, description="share of the frames that are lost, of a scene (a dataset's clips are whole)"
     )
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=0, description="selects jitter and lost frames")
-    time_s: Times | None = Field(
+    time_s: Annotated[tuple[_StoredTime, ...], Field(min_length=1, max_length=MAX_ROWS)] | None = Field(
         default=None,
         description="the times that a user's own cameras stored, with their gaps, in place of frame rates; the first "
         "frame begins with the sequence",
@@ -410,16 +411,28 @@ class Sequence(Spec):
         """Return the sequence with its files read in; paths are relative to `base`.
 
         Raises:
-            InputError: a file cannot be read, or its values do not fit.
+            InputError: a file cannot be read, its values do not fit, or a table has another zero of time.
         """
         changes: dict[str, Any] = {}
         try:
             for key, table in _TABLES.items():
                 if isinstance(source := getattr(self, key), TraceFile):
                     changes[key] = source.read(table, base)
+                    self._check_times(changes[key], str((base or Path()) / source.file))
+                else:
+                    self._check_times(source)
             key = "timestamps"
             if self.timestamps is not None and self.timestamps.file is not None:
                 changes[key] = self.timestamps.resolved(base)
         except InputError as error:
             raise error if error.source else error.placed(under=key) from None
         return self.model_copy(update=changes) if changes else self
+
+    def _check_times(self, table: Spec, source: str = "") -> None:
+        """Check that a table, unless it has one row alone, has values at some time of the sequence."""
+        if not isinstance(table, _Table) or len(table.time_s) == 1:
+            return
+        first, last, end = table.time_s[0], table.time_s[-1], self.duration_s
+        if first > end or last < 0.0:
+            reason = f"{first:g} to {last:g} s is outside the sequence, which begins at 0 s and lasts {end:g} s"
+            raise InputError(reason, source=source, path="time_s")
