@@ -196,6 +196,11 @@ def test_a_section_takes_its_origin_from_the_one_above():
     assert origins.measured("2026-11-24 scripts/test") == (datetime.date(2026, 11, 24), "scripts/test")
 
 
+def test_every_bench_is_on_its_page():
+    page = (DOCS / "benches.md").read_text(encoding="utf-8")
+    assert [path.name for path in (ROOT / "scripts").glob("bench_*.py") if f"`{path.name}`" not in page] == []
+
+
 def test_pictures_are_small():
     sizes = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
     assert max(sizes.values()) < 100_000, sizes
