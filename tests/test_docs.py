@@ -133,6 +133,12 @@ def test_relative_links_resolve(pages, source):
     assert wrong == []
 
 
+def test_no_page_names_another_by_its_file(pages):
+    """A page of the site is a link. Pages in `code` are files of the checkout, such as those to edit."""
+    plain = {name: re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", text, flags=re.DOTALL) for name, text in pages.items()}
+    assert [(name, found) for name, text in plain.items() for found in re.findall(r"docs/\w+\.md", text)] == []
+
+
 def anchors_of(page: str) -> set[str]:
     """The anchors of a page's headings, as GitHub and MyST make them."""
     heads = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
