@@ -133,6 +133,12 @@ def test_relative_links_resolve(pages, source):
     assert wrong == []
 
 
+def test_no_page_names_another_by_its_file(pages):
+    """A page of the site is a link. Pages in `code` are files of the checkout, such as those to edit."""
+    plain = {name: re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", text, flags=re.DOTALL) for name, text in pages.items()}
+    assert [(name, found) for name, text in plain.items() for found in re.findall(r"docs/\w+\.md", text)] == []
+
+
 def anchors_of(page: str) -> set[str]:
     """The anchors of a page's headings, as GitHub and MyST make them."""
     heads = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
@@ -194,6 +200,11 @@ def test_a_section_takes_its_origin_from_the_one_above():
     assert origins.origin({"A": "cited"}, found["B"][0]) == "cited"
     assert origins.origin({"A": "cited"}, found["C"][0]) is None
     assert origins.measured("2026-11-24 scripts/test") == (datetime.date(2026, 11, 24), "scripts/test")
+
+
+def test_every_bench_is_on_its_page():
+    page = (DOCS / "benches.md").read_text(encoding="utf-8")
+    assert [path.name for path in (ROOT / "scripts").glob("bench_*.py") if f"`{path.name}`" not in page] == []
 
 
 def test_pictures_are_small():

@@ -71,6 +71,7 @@ def commands() -> dict[str, str]:
     text = app.generate_docs(output_format="markdown")
     # Cyclopts names the program as it was started, which is here "python -m sphinx" or the like.
     text = re.sub(r"^(eyerender[\w -]*?) -m \w+", r"\1", text, flags=re.MULTILINE)
+    text = re.sub(r"docs/(\w+)\.md", r"[\1](../\1.md)", text)
     # A code block in a language that Pygments does not know would be a warning.
     listed, *sections = re.split(r"^(?=## eyerender )", text.replace("```console", "```sh"), flags=re.MULTILINE)
     summaries = dict(re.findall(r"^\* \[`([\w-]+)`\]\(.*?\): (.*)$", listed, re.MULTILINE))

@@ -11,7 +11,7 @@ DATA = Path(__file__).resolve().parents[1] / "data"
 
 def tables(data: dict[str, Any]) -> str:
     """The tables of one file: a section for each group of rows."""
-    text = f"Measured on {data['measured']} with version {data['version']}, on {data['on']}.\n\n"
+    text = f"Measured {data['measured']} with version {data['version']}, on {data['on']}.\n\n"
     for title, rows in data["groups"].items():
         text += (
             f"## {title}\n\n| quantity | compared with | largest deviation | tolerance of the test | comparisons |\n"

@@ -32,7 +32,7 @@ class RunOptions:
         threads: Total number of CPU threads (default: all).
         timeout_s: Seconds without a sign of life after which a worker is ended and its shard is retried.
         overwrite: Replace the contents of the folder.
-        same_bytes: Refuse shards that processes with another rounding made (docs/datasets.md), instead of a warning.
+        same_bytes: Refuse shards that processes with another rounding made (docs/dataset_runs.md); default: warn.
         repair: Compare finished shards with their checksums first, and make damaged ones again. Shards of pictures in
             files are always compared.
     """
