@@ -103,7 +103,7 @@ def _nearest(misses: Floats, count: int) -> Bools:
 
 
 def _misses(design: Floats, places: Floats, rows: Bools) -> Floats:
-    """Return the distances (starts, n) of all places from the least-squares polynomial of each start's rows (starts, n).
+    """Return the distances (starts, n) of all places from the least-squares polynomial of each start's rows.
 
     The terms are of order one, so the normal equations serve. A slight ridge is for starts that do not determine them.
     """

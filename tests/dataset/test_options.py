@@ -59,7 +59,9 @@ def test_samples_per_pixel_are_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("argv", "shards"),
     [
-        (["--count", "5000000", "--subjects", "1000", "--layout", "webdataset"], 5000),
+        pytest.param(
+            ["--count", "5000000", "--subjects", "1000", "--layout", "webdataset"], 5000, marks=pytest.mark.slow
+        ),
         (["--count", "5000800", "--layout", "webdataset", "--shard-size", "500"], 10002),  # 1645 plans
     ],
 )

@@ -191,7 +191,7 @@ def written(path, name):
 @pytest.mark.parametrize("name", ["headset", "people_openeds"])
 def test_normals_are_judged_against_their_own_rays(tmp_path, capsys, name):
     folder = tmp_path / "out"
-    made = ["generate", written(tmp_path / "d.yaml", name), "-o", str(folder), "--workers", "1", "--count", "2"]
+    made = ["generate", written(tmp_path / "d.yaml", name), "-o", str(folder), "--workers", "1", "--count", "1"]
     with single_workers_in_process():
         assert run(made) == 0
     assert run(["validate", str(folder)]) == 0, capsys.readouterr().out

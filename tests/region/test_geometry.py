@@ -148,7 +148,7 @@ def check(i):
 
 
 def test_seeded_instances_hold():
-    for i in range(40):
+    for i in range(20):
         check(i)
 
 
