@@ -44,7 +44,7 @@ CAMERAS = {
 RING = {"centre_mm": [11.0, -38.0, -2.0], "inner_radius_mm": 4.0, "outer_radius_mm": 9.0, "depth_mm": 2.0}
 OPENING = {"centre": [0.02, -0.1], "half_size": [2.0, 0.16], "power": 8, "edge_px": 1}
 ALMOST_ALL, NEAR = 0.99, 0.01
-ESTIMATORS = {"guestrin-eizenman": er.gaze.GuestrinEizenman(), "hennessey": er.gaze.Hennessey()}
+ESTIMATORS: dict[str, er.gaze.GuestrinEizenman | er.gaze.Hennessey] = {"guestrin-eizenman": er.gaze.GuestrinEizenman(), "hennessey": er.gaze.Hennessey()}
 
 
 def rig_of(name: str) -> dict[str, Any]:

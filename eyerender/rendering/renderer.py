@@ -130,15 +130,7 @@ class Renderer:
             bound, surroundings = self.bind(job, lit=False)
             marks = self._mirror_images(bound.host).seen(surroundings, blur)[0], *_marks(bound, job, surroundings)()
         mirrored, labels, margins, bright, hits = marks
-        exposed = tuple(
-            Exposed(
-                np.mean(pictures[id(part)], axis=0) if len(part.jobs) > 1 else pictures[id(part)][0],
-                tuple(glints[id(part)]),
-                part.rows,
-                np.mean(in_lenses[id(part)], axis=0) if in_lenses[id(part)] else None,
-            )
-            for part in parts
-        )
+        exposed = tuple(_exposed(part, pictures[id(part)], glints[id(part)], in_lenses[id(part)]) for part in parts)
         return RawFrame(
             job=job, exposed=exposed, blur=blur, mirrored=mirrored, labels=_by_rows(labels, rows), failed=failed,
             lid_margins_px=margins, highlights=bright, hits=hits, around=None if around is None else around(),
@@ -167,6 +159,12 @@ class Renderer:
         lit: whether to compute light, not only geometry.
         """
         return self._builder.set(job, lit=lit)
+
+
+def _exposed(part: SubFrames, pictures: list[Singles], glints: list[Shine], in_lenses: list[Singles]) -> Exposed:
+    """Average the light of the moments of a part of an exposure."""
+    mean = pictures[0] if len(pictures) == 1 else np.mean(pictures, axis=0)
+    return Exposed(mean, tuple(glints), part.rows, np.mean(in_lenses, axis=0) if in_lenses else None)
 
 
 def _lamps(job: RenderJob) -> tuple[float, ...]:
