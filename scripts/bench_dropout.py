@@ -44,7 +44,7 @@ CAMERAS = {
 RING = {"centre_mm": [11.0, -38.0, -2.0], "inner_radius_mm": 4.0, "outer_radius_mm": 9.0, "depth_mm": 2.0}
 OPENING = {"centre": [0.02, -0.1], "half_size": [2.0, 0.16], "power": 8, "edge_px": 1}
 ALMOST_ALL, NEAR = 0.99, 0.01
-ESTIMATORS: dict[str, er.gaze.GuestrinEizenman | er.gaze.Hennessey] = {"guestrin-eizenman": er.gaze.GuestrinEizenman(), "hennessey": er.gaze.Hennessey()}
+ESTIMATORS: dict[str, Any] = {"guestrin-eizenman": er.gaze.GuestrinEizenman(), "hennessey": er.gaze.Hennessey()}
 
 
 def rig_of(name: str) -> dict[str, Any]:
@@ -128,9 +128,9 @@ def data_loss_rows(report: Report, count: int, must: float | None) -> None:
             lost.setdefault(name, []).append(~rays.ok)
     report.add(row("ring: frames without two glints or a pupil", float(np.mean(missing)), "share"))
     for name, found in lost.items():  # Hennessey's assumed eye has no pupil in some oblique frames
-        bars = {"must": must} if name == "guestrin-eizenman" else {"aim": must}
+        bar, aim = (must, None) if name == "guestrin-eizenman" else (None, must)
         off = abs(float(np.mean(found)) - float(np.mean(missing)))
-        report.add(row(f"ring: frames without an estimate of {name}, beside these", off, "share", **bars))
+        report.add(row(f"ring: frames without an estimate of {name}, beside these", off, "share", bar, aim))
 
 
 def main() -> int:
