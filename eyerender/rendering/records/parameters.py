@@ -222,7 +222,7 @@ def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
     """Rebuild a tree of parameters; `leaf(size)` returns each leaf, in the order of `packed`."""
     node: Any = tree
     made: Any
-    if names := names_of(type(node)):
+    if names := names_of(type(node)):  # type: ignore[arg-type]  # classes are hashable
         made = type(node)(**{name: rebuilt(getattr(node, name), leaf) for name in names})
     elif _is_branch(node):
         made = tuple(rebuilt(part, leaf) for part in node)
@@ -232,7 +232,7 @@ def rebuilt(tree: _Tree, leaf: Callable[[int], Any]) -> _Tree:
 
 
 def _leaves(node: Any) -> Iterator[Any]:
-    if names := names_of(type(node)):
+    if names := names_of(type(node)):  # type: ignore[arg-type]  # classes are hashable
         for name in names:
             yield from _leaves(getattr(node, name))
     elif _is_branch(node):
@@ -244,7 +244,7 @@ def _leaves(node: Any) -> Iterator[Any]:
 
 def _is_branch(node: Any) -> bool:
     """Return whether a tuple holds parameters or vectors; a tuple of plain numbers is a leaf."""
-    return isinstance(node, tuple) and any(names_of(type(part)) or np.ndim(part) for part in node)
+    return isinstance(node, tuple) and any(names_of(type(part)) or np.ndim(part) for part in node)  # type: ignore[arg-type]
 
 
 @cache
