@@ -247,7 +247,7 @@ BOUNDS = {
     "cli": 2680,  # tables of features, targets and gaze; units, intervals, jitter of films, for readers of reports
     "dataset": 11780,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 4060,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
-    "extraction": 6090,
+    "extraction": 6100,
     "eye": 4540,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1840,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5310,  # tables of other trackers; intervals of budgets; precision, for laboratories

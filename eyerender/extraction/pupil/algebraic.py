@@ -169,7 +169,7 @@ def _least_direction(scatter: Floats, gradient: Floats) -> Floats:
 
 @inlined
 def _unit(points: Floats, weight: Floats) -> tuple[float, float, float]:
-    """Compute the mean of the points (n, 2) that count and their largest offset, for scaling to small numbers about 0."""
+    """Compute the weighted mean of points (n, 2) and their largest offset, for scaling to small numbers about 0."""
     total = x = y = scale = 0.0
     for i in range(weight.size):
         total, x, y = total + weight[i], x + weight[i] * points[i, 0], y + weight[i] * points[i, 1]

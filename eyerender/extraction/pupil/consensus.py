@@ -114,13 +114,13 @@ def _random_fits(points: Floats, arcs: Indices, centre: tuple[float, float], dra
         number[i] = arcs[i] * PIECES + int((bearing / (2.0 * math.pi) + 0.5) * PIECES) % PIECES
         size[number[i]] += 1
     first, order, place = np.empty(size.size, dtype=np.int64), np.empty(n, dtype=np.int64), 0
-    long, count, total = np.empty(size.size, dtype=np.int64), 0, 0
+    long, count = np.empty(size.size, dtype=np.int64), 0
     for k in range(size.size):
         first[k] = place
         place += size[k]
         if size[k] >= 4:
             long[count] = k
-            count, total = count + 1, total + size[k]
+            count += 1
     at = first.copy()
     for i in range(n):
         order[at[number[i]]] = i
@@ -129,22 +129,29 @@ def _random_fits(points: Floats, arcs: Indices, centre: tuple[float, float], dra
         return np.empty((0, 5))
     chosen, picked = np.empty((draws.shape[0], 3 * POINTS_PER_PIECE, 2)), np.empty(3, dtype=np.int64)
     for m in range(draws.shape[0]):
-        left = total
+        _pick(size, long[:count], draws[m], picked)
         for j in range(3):
-            rest, k = draws[m, j] * left, -1
-            for one in range(count):
-                if (j > 0 and long[one] == picked[0]) or (j > 1 and long[one] == picked[1]):
-                    continue
-                k = long[one]
+            for i in range(POINTS_PER_PIECE):
+                at_piece = int(draws[m, 3 + POINTS_PER_PIECE * j + i] * size[picked[j]])
+                copy(points[order[first[picked[j]] + at_piece]], chosen[m, POINTS_PER_PIECE * j + i])
+    return direct_fits(chosen)
+
+
+@inlined
+def _pick(size: Indices, pieces: Indices, draws: Floats, picked: Indices) -> None:
+    """Write three different pieces (3,), drawn by their numbers of points `size` with random numbers `draws` (3,)."""
+    for j in range(3):
+        rest = 0.0
+        for k in pieces:
+            if not ((j > 0 and k == picked[0]) or (j > 1 and k == picked[1])):
+                rest += size[k]
+        rest *= draws[j]
+        for k in pieces:
+            if not ((j > 0 and k == picked[0]) or (j > 1 and k == picked[1])):
+                picked[j] = k
                 rest -= size[k]
                 if rest < 0.0:
                     break
-            picked[j] = k
-            left -= size[k]
-            for i in range(POINTS_PER_PIECE):
-                draw = draws[m, 3 + POINTS_PER_PIECE * j + i]
-                copy(points[order[first[k] + int(draw * size[k])]], chosen[m, POINTS_PER_PIECE * j + i])
-    return direct_fits(chosen)
 
 
 def _sane(a: Any, b: Any, candidate: Candidate, shape: Shape) -> Any:
