@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import pytest
 
 from eyerender.backends.choose import choose_backend
 from eyerender.base.errors import BackendError
-from tests.support.quick import Quick, Recorder, listed
+from tests.support.quick import Quick, Recorder, listed, name_of
 
 # A shell that starts the suite in the background ignores Ctrl-C for it, and the processes that tests interrupt would
 # inherit that.
@@ -72,9 +72,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=[item for item in items if not is_quick(item)])
         items[:] = [item for item in items if is_quick(item)]
     longest_s: Counter[Path] = Counter()
-    not_quick: Counter[Path] = Counter()
+    not_quick: defaultdict[Path, set[str]] = defaultdict(set)
     for item in items:
         allowed = item.get_closest_marker("timeout")
         longest_s[item.path] = max(longest_s[item.path], int(allowed.args[0]) if allowed else 0)
-        not_quick[item.path] += not is_quick(item)
-    items.sort(key=lambda item: (-longest_s[item.path], -not_quick[item.path]))  # the others keep their order
+        if not is_quick(item):
+            not_quick[item.path].add(name_of(item))
+    items.sort(key=lambda item: (-longest_s[item.path], -len(not_quick[item.path])))  # the others keep their order

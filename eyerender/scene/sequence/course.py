@@ -152,7 +152,7 @@ def _carried(turn_rad: Floats, shift_mm: Floats) -> Callable[[Floats], Floats] |
 
 def _slow_noise(times_s: Floats, low_hz: float | None, high_hz: float, axes: int, rng: np.random.Generator) -> Floats:
     """Return noise (n, axes) of deviation 1 below a frequency, or between two."""
-    from scipy.signal import butter, sosfilt  # its import takes a second, and every scene imports this module
+    from scipy.signal import butter, sosfilt  # takes a third of a second, and every scene imports this module
 
     band = [low_hz, high_hz] if low_hz is not None else high_hz
     filters = butter(2, band, "bandpass" if low_hz is not None else "lowpass", fs=1 / STEP_S, output="sos")

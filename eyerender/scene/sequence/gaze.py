@@ -217,7 +217,7 @@ def _drift(model: GazeModel, number: Ints, habits: Habits, rng: np.random.Genera
 
     Its velocity is an Ornstein-Uhlenbeck process, whose integral diffuses by 2 D t along each axis.
     """
-    from scipy.signal import lfilter  # its import takes a second, and every scene imports this module
+    from scipy.signal import lfilter  # takes a third of a second, and every scene imports this module
 
     kept = np.exp(-STEP_S / _CORRELATED_S)
     size = np.radians(np.sqrt(model.drift_arcmin2_s * habits.drift / _CORRELATED_S) / 60.0)

@@ -59,7 +59,7 @@ def oscillation_mm(drive_rad: Floats, step_s: float, frequency_hz: float, dampin
 
     Its response to g theta is that of -s^2 / (s^2 + 2 z w s + w^2), discretised by the bilinear rule.
     """
-    from scipy.signal import cont2discrete, lfilter  # its import takes a second, and every scene imports this module
+    from scipy.signal import cont2discrete, lfilter  # takes a third of a second, and every scene imports this module
 
     w = 2 * np.pi * frequency_hz
     numerator, denominator, _ = cont2discrete(
