@@ -8,7 +8,8 @@ temporal and +1 nasal; the height of a lid above or below the chord is
 
 with its peak at a = (p - q) / (p + q). The upper lid's height follows the turn of the eye and the blink: its middle
 lies at an angle about the globe's centre that turns by `upper_follows` of the eye's elevation. `wide` raises it, up to
-2.5 mm. `squint` raises the lower lid towards the chord, and a blink shuts both where the lower lid then is.
+2.5 mm. `squint` raises the lower lid towards the chord, and a blink shuts both where the lower lid then is. In a blink
+the lower lid slides towards the nose, along its own edge: its columns do, with their skin and lashes.
 
 In front of the globe, the contour lies on it. Beyond a polar angle of 51 (nasal) to 58 degrees (temporal) it leaves the
 globe along the tangent, which flattens towards the canthi.
@@ -34,6 +35,7 @@ _GAP_MM = 0.01
 _LEAST_MM = 1.0  # smallest height of the fissure except in a blink
 _FLAT_MM = -0.6  # highest middle of the lower margin, below the chord
 _WIDE_MM = 2.5  # highest rise of the upper margin's middle above its rest
+_SLIDE_MM = 3.0  # way of the lower lid's middle in a whole blink; Doane (1980) saw 2 to 5 mm
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -81,8 +83,9 @@ def canthi(spec: Region) -> tuple[Floats, Floats]:
 
 def contour(spec: Region, globe: Globe, columns: int = COLUMNS) -> Contour:
     """Compute the contour of the fissure for a posed globe."""
-    angle, a, upper, on_globe, flat = _columns(columns)
-    yz, openness = _outline(spec, globe.radius_mm, np.asarray(globe.elevation_rad), a, upper)
+    slide = _slide(spec)
+    angle, a, upper, on_globe, flat = _columns(columns, slide)
+    yz, openness = _outline(spec, globe.radius_mm, np.asarray(globe.elevation_rad), columns, slide)
     centre = globe.rest + on_globe * (globe.centre - globe.rest)
     point, normal = _support(globe.radius_mm, centre, yz)
     point = globe.pushed_out(point, spec.lids.film_mm)
@@ -115,8 +118,9 @@ def inner_margins(spec: Region, globe: Globe, motions: tuple[Floats, Floats], co
     """
     turn, shift = motions
     mirror = globe.mirror
-    _, a, upper, on_globe, _ = _columns(columns)
-    yz, _ = _outline(spec, globe.radius_mm, np.arcsin(np.clip(turn[:, 2, 0], -1, 1)), a, upper)
+    slide = _slide(spec)
+    on_globe = _columns(columns, slide)[3]
+    yz, _ = _outline(spec, globe.radius_mm, np.arcsin(np.clip(turn[:, 2, 0], -1, 1)), columns, slide)
     moved = mirror * (turn @ globe.centre_mm + shift)
     point, _ = _support(globe.radius_mm, globe.rest + on_globe * (moved - globe.rest)[:, None], yz)
     # The globe at rest pushes them out in its own frame.
@@ -125,21 +129,32 @@ def inner_margins(spec: Region, globe: Globe, motions: tuple[Floats, Floats], co
     return np.asarray(pushed @ np.swapaxes(turn, 1, 2) + shift[:, None])
 
 
-@lru_cache(maxsize=4)
-def _columns(count: int) -> tuple[Floats, ...]:
+def _slide(spec: Region) -> float:
+    """Compute how far the lower lid's middle slides towards the nose, in half widths of the fissure."""
+    return spec.moved("blink") * _SLIDE_MM / (spec.fissure.width_mm / 2)
+
+
+@lru_cache(maxsize=16)
+def _columns(count: int, slide: float) -> tuple[Floats, ...]:
     """Compute angle, along and upper of `Contour`, the globe's share in the contour's centre, outward directions."""
     angle = 2 * np.pi * np.arange(count) / count
     a = np.cos(angle)
     upper = np.where(np.sin(angle) >= -1e-12, 1.0, -1.0)
+    if slide > 0:
+        a = np.where(upper > 0, a, a + slide * (1 - a * a))
+        angle = np.where(upper > 0, angle, 2 * np.pi - np.arccos(a))
     on_globe = step(np.abs(np.sin(angle)), 0.08, 0.5)[:, None]
     sideways = np.sign(a) * np.abs(a) ** 6
     flat = unit(np.stack([np.zeros_like(a), sideways, np.sin(angle) + 0.02 * upper], axis=-1))
     return tuple(sealed(v) for v in (angle, a, upper, on_globe, flat))
 
 
-def _outline(spec: Region, radius_mm: float, elevation_rad: Floats, a: Floats, upper: Floats) -> tuple[Floats, Floats]:
+def _outline(
+    spec: Region, radius_mm: float, elevation_rad: Floats, columns: int, slide: float
+) -> tuple[Floats, Floats]:
     """Compute the inner edge (y, z) in frontal view (..., n, 2), and the openness (...), for elevations (...)."""
     f, lids = spec.fissure, spec.lids
+    _, a, upper, _, _ = _columns(columns, slide)
     middle, half = canthi(spec)
     chord = middle + a[:, None] * half
     middle_z = middle[1] + f.peak * half[1]
@@ -159,7 +174,7 @@ def _outline(spec: Region, radius_mm: float, elevation_rad: Floats, a: Floats, u
     # Closed lids meet near the place of the lower lid. A lower lid that is very low moves up to meet the other.
     shut = 0.92 * low + 0.08 * np.minimum(high, 0.0)
     shut = np.maximum(shut, -3.2 + 0.5 * (shut + 3.2))
-    shape_up, shape_low, bay = _shapes(len(a), f.peak)
+    shape_up, shape_low, bay = _shapes(columns, slide, f.peak)
     closed = shut[..., None] * shape_low
     b = spec.moved("blink")
     up = (1 - b) * high[..., None] * shape_up * bay + b * (closed + _GAP_MM * shape_up)
@@ -170,9 +185,9 @@ def _outline(spec: Region, radius_mm: float, elevation_rad: Floats, a: Floats, u
 
 
 @lru_cache(maxsize=16)
-def _shapes(columns: int, peak: float) -> tuple[Floats, ...]:
+def _shapes(columns: int, slide: float, peak: float) -> tuple[Floats, ...]:
     """Compute heights of the upper and the lower lid over the chord, and the share of them beside the caruncle."""
-    a = _columns(columns)[1]
+    a = _columns(columns, slide)[1]
     bay = 1 - 0.42 * np.exp(-(((1 - a) / 0.19) ** 2))  # the lids are close together there
     return tuple(sealed(v) for v in (_shape(a, peak, 0.98), _shape(a, -0.08, 0.92), bay))
 

@@ -7,8 +7,8 @@ from ..base.jit import compiled
 
 
 @compiled()
-def crossed(points: Floats, columns: Ints, rows: Floats, pieces: int, out: Bools) -> None:
-    """Find the curves whose first pieces cross the triangles of a sheet in some of its columns.
+def crossed(points: Floats, columns: Ints, rows: Floats, out: Bools) -> None:
+    """Find the curves that cross the triangles of a sheet in some of its columns.
 
     The sheet has two triangles between each two rows and columns; the last column joins the first. The test is that of
     Moeller and Trumbore.
@@ -17,12 +17,11 @@ def crossed(points: Floats, columns: Ints, rows: Floats, pieces: int, out: Bools
         points: (n, k, 3) points of the curves.
         columns: (n, c) columns of the sheet that may meet each curve.
         rows: (r, columns, 3) vertices of the sheet.
-        pieces: number of pieces that are tested.
         out: (n,) whether a curve crosses the sheet.
     """
     count = rows.shape[1]
     for i in range(len(points)):
-        for j in range(pieces):
+        for j in range(points.shape[1] - 1):
             ox, oy, oz = points[i, j, 0], points[i, j, 1], points[i, j, 2]
             wx, wy, wz = points[i, j + 1, 0] - ox, points[i, j + 1, 1] - oy, points[i, j + 1, 2] - oz
             for c in range(columns.shape[1]):

@@ -30,13 +30,12 @@ from .lids import CONJUNCTIVA, EDGE_MM, FINE, LID, MARGIN, Sheet, lash_line
 _ABOVE_MM = np.minimum(0.03 + 0.06 * np.arange(1, SEGMENTS + 1), 0.2)  # height of points after the root, on the skin
 _REACH_ROWS = 12  # rows beyond the crease, about a centimetre, where lashes may meet skin
 _CAUGHT_MM = 0.3  # a lash that is still this far inside is caught
-_NEAR_COLUMNS = 6
+_NEAR_COLUMNS = 3  # of every second one, on either side
 _SEARCH_MM = 1.5  # distance up to which skin lifts a lash
 _NEARLY = 0.2  # share by which the skin that is found may be farther away than the nearest
 _OFF_GLOBE_MM = 0.3  # least distance of the points beyond the root from the globe
 _TIP = 0.15  # radius of the tip over that of the root; the map makes thin tips paler too (`skin.lash_band`)
 _BLOBS = 0.9  # spread of the thickness along a lash with mascara, which dries in lumps (chosen)
-_FIRST_PIECES = 3  # beyond the root, that may meet skin near it
 _KINK = 0.45  # cosine of the sharpest bend between two pieces; no lash's curl is this sharp
 
 
@@ -214,13 +213,14 @@ def _grown(spec: Region, p: LashPlan, c: Contour, line: Floats) -> tuple[Floats,
 
 
 def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
-    """Return whether the first pieces of curves (n, k, 3) cross the sheet near their roots (n,), on either lid."""
-    n = sheet.vertices.shape[1]
-    across = np.rint(angle / (2 * np.pi) * n).astype(int)[:, None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)
-    columns = np.concatenate([across, n - across], axis=1) % n
-    last = CONJUNCTIVA + MARGIN + LID + (-3 if sheet.contour.openness < 1 else 3)  # of an open lid, with its fold
+    """Return whether curves (n, k, 3) cross the sheet near the angles (n,) of their roots, on either lid."""
+    c = sheet.contour.every(2)  # the mesh has every second column there
+    n = len(c.angle)
+    own = np.rint(angle / (2 * np.pi) * n).astype(int) % n
+    apart = np.abs(c.along[own, None] - c.along) + 2.0 * (c.upper[own, None] == c.upper)
+    near = np.stack([own, np.argmin(apart, axis=1)], axis=1)[..., None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)
     out = np.zeros(len(angle), dtype=bool)
-    crossed(points, columns, np.ascontiguousarray(sheet.vertices[CONJUNCTIVA + 2 : last]), _FIRST_PIECES, out)
+    crossed(points, near.reshape(len(angle), -1) % n, sheet.coarse[: MARGIN + LID + 1], out)
     return out
 
 

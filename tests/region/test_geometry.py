@@ -130,7 +130,9 @@ def check(i):
 
     # Lids do not pass through each other: at the same place along the fissure the upper margin's inner edge is above.
     half = (columns - 1) // 2
-    over = grid[CONJUNCTIVA, 1:half, 2] - grid[CONJUNCTIVA, columns - 2 : half : -1, 2]
+    edge = grid[CONJUNCTIVA] * [1, -1 if globe.mirrored else 1, 1]
+    upper, lower = edge[1:half], edge[half:]  # in a blink the columns of the lower one slide along it
+    over = upper[:, 2] - np.interp(upper[:, 1], lower[:, 1], lower[:, 2])
     assert over.min() > -INTO_MM, note
 
     # Lashes: beyond their roots none is under the skin or in the globe.
@@ -150,6 +152,18 @@ def check(i):
 def test_seeded_instances_hold():
     for i in range(20):
         check(i)
+
+
+@pytest.mark.parametrize("blink", [0.4, 1.0])
+def test_the_lower_lid_slides_towards_the_nose_along_its_edge(blink):
+    spec, globe = Region(blink=blink), Globe.sphere()
+    open_, shut = contour(spec.with_lids(), globe), contour(spec, globe)
+    moved = (shut.along - open_.along) * spec.fissure.width_mm / 2
+    lower = shut.upper < 0
+    middle = np.argmin(np.abs(np.where(lower, open_.along, 9.0)))
+    assert moved[middle] == pytest.approx(3.0 * blink, abs=0.01)
+    assert np.all(moved[~lower] == 0)
+    assert np.all(np.diff(shut.along[lower]) > 0)
 
 
 @pytest.mark.slow
