@@ -95,7 +95,7 @@ def test_a_draw_that_would_change_within_a_clip_is_refused():
 def test_the_length_of_clips_must_be_plain():
     scene = spec().to_mapping()["scene"]
     scene["sequence"]["duration_s"] = {"draw": "uniform", "low": 0.1, "high": 0.2}
-    with pytest.raises(InputError, match="must be plain numbers"):
+    with pytest.raises(InputError, match="must be a plain number"):
         spec(scene=scene)
 
 

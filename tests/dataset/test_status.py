@@ -140,9 +140,8 @@ def test_a_fingerprint_is_of_the_rounding_and_not_of_the_process():
 
 @pytest.mark.packaging
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names code for x86")
-def test_the_code_of_blas_changes_it_and_the_processor_of_numba_does_not():
+def test_the_code_of_blas_changes_it():
     assert elsewhere(OPENBLAS_CORETYPE="Prescott") != rounding()
-    assert elsewhere(NUMBA_CPU_NAME="haswell") == rounding()
 
 
 @pytest.fixture(scope="module")

@@ -344,7 +344,7 @@ REFUSED = [
     ({"file": "text.ply"}, "text.ply: is not a PLY file that can be read (its header does not begin or end)"),
     ({"file": "empty.obj"}, "empty.obj: "),
     ({"file": "hole.obj"}, "not finite"),
-    ({"file": "head.stl"}, "head.stl: holds no triangles"),
+    ({"file": "head.stl"}, "head.stl: is not a readable mesh"),
     ({"file": "head.3ds"}, "head.3ds: must end with .obj, .stl, .ply, .glb"),
     ({"file": "other.json"}, "unit: belongs in the manifest"),
 ]
