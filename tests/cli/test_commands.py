@@ -62,7 +62,7 @@ def test_rendered_features_are_the_analytic_ones(tmp_path, capsys, lens):
     found = json.loads(capsys.readouterr().out)
     features = found["features"]
     assert (features["pupils"]["found"], features["glints"]["found"]) == (2, 6)
-    assert features["pupil_centre_px"]["max"] < 0.1
+    assert features["pupil_centre_px"]["max"] < 0.15
     assert features["glint_px"]["max"] < 0.06
     # Extraction names the lights by the same lens.
     images = sorted(str(image) for image in (folder / "images").iterdir())
