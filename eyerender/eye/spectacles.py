@@ -385,14 +385,6 @@ class BySide(Spec):
     right: OneEye | None = Field(default=None, description="one lens, or a list in order from the eye")
     left: OneEye | None = Field(default=None, description="the same for the left eye")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _alone(cls, given: Any) -> Any:
-        for key in given if isinstance(given, Mapping) else ():
-            if key in SpectacleLens.model_fields:
-                raise KeyProblem(key, "cannot stand beside `right` and `left`; give it for each eye")
-        return given
-
 
 Spectacles = Annotated[
     Annotated[SpectacleLens, Tag("LensSpec")]

@@ -270,11 +270,6 @@ def test_a_material_may_be_the_number_that_yaml_reads(given):
     assert lens_of(material=given).material == "1.60"
 
 
-def test_keys_of_a_lens_do_not_stand_beside_the_sides():
-    with pytest.raises(InputError, match=r"spectacles\.sphere_d: cannot stand beside `right` and `left`"):
-        subject({"right": {"sphere_d": -1.0}, "sphere_d": -2.0})
-
-
 @pytest.mark.parametrize(("place", "warned"), [(3.0, True), (12.0, False)])
 def test_lenses_among_lids_are_warned_of(place, warned):
     for given in ({"vertex_mm": place}, {"right": [{"vertex_mm": place}]}):
