@@ -248,7 +248,7 @@ BOUNDS = {
     "dataset": 11780,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 4060,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 6100,
-    "eye": 4540,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
+    "eye": 4570,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1840,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5310,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 3630,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide
@@ -257,7 +257,7 @@ BOUNDS = {
     "region": 4250,  # heads from STL and GLB files, with all mistakes named at once; frames of spectacles before eyes
     "rendering": 13190,  # pictures through spectacles and of their frames, reflections and masks of them, for the same
     "report": 970,
-    "rig": 4615,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
+    "rig": 4630,  # fisheyes, measured fall-off, flipped pictures, files of devices, for owners of headsets
     "scene": 4370,  # people, times and lens reflections in records; cameras past lenses; refusals where written
     "torch": 820,  # a small network for gaze, which an example and a study share, for trainers
 }

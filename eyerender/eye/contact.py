@@ -73,7 +73,8 @@ class ContactLens(Spec):
         limbus, nasal = float(eye.limbus_radius_mm), 1.0 if eye.side == "right" else -1.0
         shift = np.array([nasal, 1.0]) * self.decentration_mm
         if 0.5 * self.diameter_mm - float(np.hypot(*shift)) < limbus:
-            raise InputError(f"must reach over the cornea, which is {2.0 * limbus:g} mm wide", path="diameter_mm")
+            path = "diameter_mm" if 0.5 * self.diameter_mm < limbus else "decentration_mm"
+            raise InputError(f"the lens must reach over the cornea, which is {2.0 * limbus:g} mm wide", path=path)
         thickness = self.thickness_mm or CENTRE_MM
         front = self._front(eye.front[0], thickness, shift)
         edge = _thinnest_mm(front, eye.front[0], limbus)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from ..base.arrays import Floats, frozen
 from ..base.errors import InputError
@@ -30,6 +30,7 @@ CENTRE_MM, EDGE_MM = 1.5, 1.0
 """Smallest thickness at the vertex and along the outline (chosen; the trade's values lie between 1 and 2 mm)."""
 _OUTLINE_POINTS = 360
 _LAST_STEP_MM = 1e-13
+_LEAST_VERTEX_MM = 1.0  # closer lenses, as tilted as worn, meet corneas and lids
 
 
 def _by_abbe(n_d: float, abbe: float) -> CauchyMedium:
@@ -180,6 +181,15 @@ class SpectacleLens(Spec):
         description="what holds the lens, in pictures with a region; default: as `{}`, and none at index 1",
     )
 
+    @field_validator("material", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """Take 1.6, which YAML reads from 1.60, for the material of this name."""
+        try:
+            return f"{float(value):.2f}"
+        except (TypeError, ValueError):
+            return value
+
     @model_validator(mode="after")
     def _of_preset(self) -> Self:
         """Fill in the keys of a preset that are not given."""
@@ -192,6 +202,8 @@ class SpectacleLens(Spec):
     def _check(self) -> Self:
         if self.prescription is not None:
             raise KeyProblem("prescription", OWN_MISSING)
+        if self.vertex_mm < _LEAST_VERTEX_MM:
+            raise KeyProblem("vertex_mm", f"is {self.vertex_mm:g} mm, on the cornea; lengths are in mm, not in metres")
         if self.surfaces is not None:
             for name in _PRESCRIBED:
                 if getattr(self, name) != type(self).model_fields[name].default:
@@ -351,7 +363,17 @@ def _form(value: object) -> str:
     return "SidesSpec" if isinstance(value, BySide) or {"right", "left"} & set(sides) else "LensSpec"
 
 
-_Lenses = Annotated[tuple[SpectacleLens, ...], Field(min_length=1, max_length=2)]
+def _in_order(lenses: tuple[SpectacleLens, ...]) -> tuple[SpectacleLens, ...]:
+    """Refuse a lens that stands within or behind the one before it."""
+    for k, (near, far) in enumerate(zip(lenses, lenses[1:], strict=False), start=1):
+        front = near.vertex_mm + near._solved().thickness_mm
+        if far.vertex_mm < front:
+            reason = f"is {far.vertex_mm:g}, but the lens before it ends at {front:.3g}; list lenses from the eye on"
+            raise KeyProblem(f"{k}.vertex_mm", reason)
+    return lenses
+
+
+_Lenses = Annotated[tuple[SpectacleLens, ...], Field(min_length=1, max_length=2), AfterValidator(_in_order)]
 OneEye = Annotated[
     Annotated[SpectacleLens, Tag("LensSpec")] | Annotated[_Lenses, Tag("ListSpec")], Discriminator(_form)
 ]

@@ -240,7 +240,10 @@ class ImageObserver:
                 # placed.
                 camera = self.camera_of(scene)
                 if shape != (camera.resolution_px[1], camera.resolution_px[0]):
-                    raise InputError(f"is {shape[1]} x {shape[0]} px, but the scene's sensor is not", source=source)
+                    w, h = camera.resolution_px
+                    reason = f"is {shape[1]} x {shape[0]} px, but the scene's sensor is {w} x {h}"
+                    hint = "windows that `render` or `generate` wrote are read by `eyerender compare FOLDER`"
+                    raise InputError(f"{reason}; {hint}", source=source)
                 sides = [EYES.index(name) for name in scene.spec.subject.eyes if camera.sees(name)]
                 eye = sides[0] if len(found) == len(sides) == 1 else eye
                 lights, reasons = _lights(one, np.zeros(2), scene.rig, camera, np.full(3, np.nan), eye)

@@ -37,6 +37,7 @@ _LEAST_MM = {
     "rig.cameras.*.sensor_mm": 0.2,
     "rig.lights.*.radius_mm": 0.02,
 }
+_VERTEX_MM = 8.0  # from the cornea to a lens of spectacles; lids and lashes reach about as far (chosen)
 # The same for positions: nothing can be this close to the world's origin, the bridge of the nose.
 _LEAST_DISTANCE_MM = 2.0
 # Globe and head, as spheres about the corneal apex and the head's position. Both are smaller than real ones, so that
@@ -93,6 +94,17 @@ def length_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
             # A lamp of size 0 is a point.
             if any(0 < size < least for size in sizes):
                 found.append(InputWarning(code="metres", reason=f"is {_shown(sizes, ' x ')} mm; {_METRES}", path=path))
+    return found
+
+
+def vertex_warnings(scene: Mapping[str, Any]) -> list[InputWarning]:
+    """Warn of spectacle lenses in a scene's mapping that stand among lids and lashes."""
+    found = []
+    for form in ("", ".*", ".right", ".right.*", ".left", ".left.*"):
+        for path, value in _values(scene, f"subject.spectacles{form}.vertex_mm".split(".")):
+            if value < _VERTEX_MM:
+                reason = f"is {value:g} mm, among lids and lashes; spectacles stand about 10 to 16 mm before the cornea"
+                found.append(InputWarning(code="vertex", reason=reason, path=path))
     return found
 
 

@@ -48,6 +48,7 @@ from ..rig.plausibility import (
     place_warnings,
     pupil_warnings,
     timing_warnings,
+    vertex_warnings,
     view_warnings,
     wavelength_warnings,
 )
@@ -428,6 +429,7 @@ class Scene:
             *pupil_warnings(self.pupil_diameter_mm, pupil),
             *wavelength_warnings(spec.wavelength_nm),
             *length_warnings(spec.to_mapping()),
+            *vertex_warnings(spec.to_mapping()),
             *(timing_warnings(self.timings) if spec.sequence is not None else ()),
             *place_warnings(rig, eyes, heads, cameras, lights),
             *mirror_warnings(spec.rig.cameras, eyes),

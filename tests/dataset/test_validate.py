@@ -180,15 +180,18 @@ def written(path, name):
     if name in shipped_datasets():
         data = yaml.safe_load(shipped_datasets()[name].read_text(encoding="utf-8"))
     else:
-        data = {"format": 3, "kind": "dataset", "name": name, "count": 2, "scene": load_scene(name).spec.to_mapping()}
+        scene = "headset" if name == "spectacles" else name
+        data = {"format": 3, "kind": "dataset", "name": name, "count": 2, "scene": load_scene(scene).spec.to_mapping()}
         data["scene"]["targets"] = {"world_mm": [[1000.0, 300.0, 200.0]]}
+    if name == "spectacles":
+        data["scene"]["subject"]["spectacles"] = {"sphere_d": -4.0}
     data["labels"] = {**data.get("labels", {}), "geometry": ["depth", "normals", "iris_coordinates", "instances"]}
     data["scene"].setdefault("image", {}).update(spp=1)
     path.write_text(yaml.safe_dump(data), encoding="utf-8")
     return str(path)
 
 
-@pytest.mark.parametrize("name", ["headset", "people_openeds"])
+@pytest.mark.parametrize("name", ["headset", "people_openeds", "spectacles"])
 def test_normals_are_judged_against_their_own_rays(tmp_path, capsys, name):
     folder = tmp_path / "out"
     made = ["generate", written(tmp_path / "d.yaml", name), "-o", str(folder), "--workers", "1", "--count", "1"]

@@ -249,6 +249,8 @@ def test_random_rays_through_random_lenses_agree_with_root_finding_in_high_preci
          "surfaces.index: must be >= 1"),
         ({"reflectance": [0.1, 1.5]}, "reflectance.1: must be < 1"),
         ({"frames": {}}, "frames: unknown key"),
+        ({"vertex_mm": 0.013}, "vertex_mm: is 0.013 mm, on the cornea; lengths are in mm, not in metres"),
+        ({"material": 1.5}, "material: must be 'CR-39'"),
     ],
 )  # fmt: skip
 def test_what_is_refused(given, message):
@@ -257,8 +259,27 @@ def test_what_is_refused(given, message):
     assert str(error.value).startswith(message)
 
 
+@pytest.mark.parametrize("places", [(13.0, 13.0), (16.0, 10.0), (13.0, 14.0)])
+def test_lenses_that_overlap_or_are_listed_from_the_world_are_refused(places):
+    with pytest.raises(InputError, match=r"spectacles\.1\.vertex_mm: .* list lenses from the eye on"):
+        subject([{"vertex_mm": place} for place in places])
+
+
+@pytest.mark.parametrize("given", [1.60, "1.6", "1.60"])
+def test_a_material_may_be_the_number_that_yaml_reads(given):
+    assert lens_of(material=given).material == "1.60"
+
+
+@pytest.mark.parametrize(("place", "warned"), [(3.0, True), (12.0, False)])
+def test_lenses_among_lids_are_warned_of(place, warned):
+    for given in ({"vertex_mm": place}, {"right": [{"vertex_mm": place}]}):
+        found = [w for w in scene(spectacles=given).warnings() if w.code == "vertex"]
+        assert bool(found) == warned
+        assert all(w.path.startswith("subject.spectacles") and w.path.endswith("vertex_mm") for w in found)
+
+
 def test_one_lens_a_list_or_each_eye_its_own():
-    one, two = {"sphere_d": -1.0}, {"sphere_d": -2.0, "mount": "rig"}
+    one, two = {"sphere_d": -1.0}, {"sphere_d": -2.0, "mount": "rig", "vertex_mm": 20.0}
     assert len(lenses_of(subject(one).spectacles, "left")) == 1
     assert [x.mean_d for x in lenses_of(subject([one, two]).spectacles, "right")] == [-1.0, -2.0]
     sides = subject({"right": one, "left": [one, two]}).spectacles
@@ -390,7 +411,7 @@ def test_a_lens_is_thick_enough_over_the_limbus_or_refused():
     assert rim == pytest.approx(EDGE_MM, abs=2e-4)
     with pytest.raises(InputError, match="thickness_mm: the front of the lens meets the cornea before the limbus"):
         ContactLens(power_d=6.0, thickness_mm=0.1).worn_by(eye)
-    with pytest.raises(InputError, match="diameter_mm: must reach over the cornea"):
+    with pytest.raises(InputError, match="decentration_mm: the lens must reach over the cornea"):
         ContactLens(diameter_mm=12.0, decentration_mm=(1.0, 0.0)).worn_by(eye)
 
 

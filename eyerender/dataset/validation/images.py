@@ -88,6 +88,7 @@ _RIMS = 11  # instance of the frame of spectacles
 _VISIBLE = 1e-8  # relative; numbers of packed lines are rounded to 5e-9
 _SAME_S = 1e-9  # times that differ by less are equal
 _UNIT, _FACING = 1e-3, 1e-3  # of normals, which half precision rounds by up to 5e-4
+_BENT = 0.5  # largest cosine behind spectacles, which turn the pixel's ray by up to 30 degrees
 _EDGES = 1e-3  # share of pixels in which two rays through one place may meet different sides of an edge
 Mask = NDArray[Any]
 
@@ -156,7 +157,8 @@ def _geometry(entry: ImageEntry, mask: Mask | None) -> Iterator[str]:
         yield "its depth holds values <= 0"
     if normals is not None:
         length, away = np.linalg.norm(normals, axis=2), np.sum(normals * _rays(entry), axis=2)
-        if np.nanmax(np.abs(length - 1), initial=0.0) > _UNIT or np.nanmax(away, initial=-1.0) > _FACING:
+        facing = _BENT if any(record.get("lens_glints") for record in entry.line["records"]) else _FACING
+        if np.nanmax(np.abs(length - 1), initial=0.0) > _UNIT or np.nanmax(away, initial=-1.0) > facing:
             yield "its normals are no unit vectors to the camera"
     if instances is None:
         return
