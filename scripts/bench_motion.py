@@ -109,8 +109,8 @@ def fixations(people: range) -> Iterator[Row]:
     for person in people:
         habits = Habits.drawn((person,))
         states = moved(person, 120.0, gaze={"drift_arcmin2_s": 0})
-        begins = np.array([a for a, _ in runs(states.events[:, 2])])
-        lasting.append(np.mean(np.diff(begins)) / habits.fixation)
+        moves = np.array(runs(states.events[:, 2]))
+        lasting.append(np.mean(moves[1:, 0] - moves[:-1, 1]) / habits.fixation)
         long = {"fixation_ms": 5000, "fixation_spread": 0, "targets": [[600.0, 0.0, 0.0]]}
         # They keep 150 ms away from the beginning of a fixation and 75 ms from its end.
         room = 1.0 - 0.225 / (5.0 * habits.fixation)
@@ -123,7 +123,7 @@ def fixations(people: range) -> Iterator[Row]:
         chase = moved(person, 30.0, gaze={"pursuit_share": 1.0, "pursuit_deg_s": 8, "fixation_ms": 800, **ALONE})
         angles = np.degrees(np.stack([chase.azimuth_rad, chase.elevation_rad]).mean(axis=2))
         speed.append(np.median(np.hypot(*np.gradient(angles, 1e-3, axis=1))[chase.events[:, 4]]))
-    yield z("interval of saccades over the person's mean, ms", lasting, 330.0)
+    yield z("duration of fixations over the person's mean, ms", lasting, 330.0)
     yield z("diffusion of drift over the person's, arcmin2/s", drift, 40.0)
     yield z("microsaccades per s", rate, 0.5)
     yield row("pursuit at 8 deg/s: distance of the median speed", abs(np.median(speed) - 8.0), "deg/s", 0.2)

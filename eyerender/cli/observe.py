@@ -54,6 +54,7 @@ def features(
     """
     # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver
+    from ..imaging.gazeseries import screen_warnings
     from ..imaging.labels import space_labels
 
     if points < 6:
@@ -69,6 +70,8 @@ def features(
     heed = Heed(strict)
     loaded = heed.scene(scene, eye=eye)
     if output is not None:
+        if format != "csv" and loaded.rig.screen is not None:
+            heed(screen_warnings(loaded.rig.screen, screen_px))
         trace = _sampled(loaded, tracker, output, format, screen_px)
         emit(trace, f"{output}: {trace['rows']} samples, {tracker.rate:g} per second", json, heed)
         return 0

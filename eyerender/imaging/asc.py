@@ -2,7 +2,8 @@
 
 Positions are pixels from the screen's upper left corner. Pupils are areas of the apparent ellipse in square pixels of
 the camera, in EyeLink's arbitrary units. Pursuit belongs to fixations, microsaccades too, as in EyeLink's own files,
-whose parser knows neither. A blink is where the pupil is hidden; it stands by itself, not within a saccade.
+whose parser knows neither. A blink lasts from the first to the last sample in which lids cover the pupil in one true
+blink; it stands by itself, not within a saccade.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Objects
+from ..base.arrays import Bools, Floats, Objects
 from ..base.errors import InputError
 from ..scene.events import has_event
+from ..scene.observation import EYES
 from .gazeseries import Display, GazeSeries, Stretch, gaze_series, runs
-from .trace import Trace
+from .trace import COVERED, Trace
 
 _FIRST_MS = 1000  # time of the first sample, as a tracker's clock runs before a recording
 _ENDS = {"fixation": "FIX", "saccade": "SACC", "blink": "BLINK"}
@@ -37,9 +39,14 @@ class _Eye:
         return self.series.eye[0].upper()
 
     @classmethod
-    def of(cls, series: GazeSeries, area: Floats) -> _Eye:
-        """Call each sample a fixation, a saccade, or a blink where there is no pupil."""
-        moves, blinks = has_event(series.events, "saccade"), has_event(series.events, "blink") & ~np.isfinite(area)
+    def of(cls, series: GazeSeries, area: Floats, covered: Bools) -> _Eye:
+        """Call each sample a fixation, a saccade, or a blink between moments at which lids cover the pupil (n,)."""
+        moves, blinks = has_event(series.events, "saccade"), has_event(series.events, "blink")
+        for _, first, last in runs(np.where(blinks, "blink", "").astype(object)):
+            shut = first + np.flatnonzero((covered & blinks)[first : last + 1])
+            blinks[first : last + 1] = False
+            if len(shut):
+                blinks[shut[0] : shut[-1] + 1] = True
         return cls(series, area, np.where(blinks, "blink", np.where(moves, "saccade", "fixation")).astype(object))
 
 
@@ -51,7 +58,10 @@ def asc_text(trace: Trace, screen_px: tuple[int, int]) -> str:
     """
     if trace.scene.rig.screen is None:
         raise InputError("is needed for a gaze in pixels", source=trace.scene.source, path="rig.screen")
-    eyes = [_Eye.of(series, area) for series, area in gaze_series(trace, screen_px)]
+    seen, covered = trace.observations.index.eye, trace.observations.pupil.reason == COVERED
+    eyes = [
+        _Eye.of(series, area, covered[seen == EYES.index(series.eye)]) for series, area in gaze_series(trace, screen_px)
+    ]
     first = eyes[0].series
     assert first.display is not None
     times = first.time_s * 1e3 + _FIRST_MS

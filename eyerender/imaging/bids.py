@@ -114,11 +114,15 @@ def _samples(series: GazeSeries) -> list[list[str]]:
 def _about_samples(series: GazeSeries) -> dict[str, Any]:
     """Describe the samples of an eye."""
     display, unit = series.display, "deg" if series.display is None else "pixel"
-    where = ("azimuth", "elevation") if display is None else ("x", "y")
+    where = (
+        ("azimuth of the line of sight, positive to the subject's left", "elevation of the line of sight, positive up")
+        if display is None
+        else ("x of the gaze, to the right from the screen's left edge", "y of the gaze, down from its upper edge")
+    )
     columns: dict[str, Any] = {
         "timestamp": {"LongName": "Time", "Description": "time of the sample in the sequence", "Units": "s"},
-        "x_coordinate": {"LongName": "Gaze position (x)", "Description": f"{where[0]} of the gaze", "Units": unit},
-        "y_coordinate": {"LongName": "Gaze position (y)", "Description": f"{where[1]} of the gaze", "Units": unit},
+        "x_coordinate": {"LongName": "Gaze position (x)", "Description": where[0], "Units": unit},
+        "y_coordinate": {"LongName": "Gaze position (y)", "Description": where[1], "Units": unit},
         "pupil_size": {"LongName": "Pupil", "Description": "true diameter of the stop of the iris", "Units": "mm"},
     }
     if np.isfinite(series.lid_opening_mm).any():

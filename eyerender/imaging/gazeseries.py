@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats, Objects
-from ..base.errors import InputError
+from ..base.errors import InputError, InputWarning
 from ..eye.pose import Poses, rigid_motion
 from ..rig.screen import ScreenPlane
 from ..scene.observation import EYES, correlated
@@ -27,6 +27,16 @@ def check_screen(screen_px: tuple[int, int]) -> None:
     """Check the width and height of a screen's picture. Raises InputError if a side is not 1 to 65,536 pixels."""
     if min(screen_px) < 1 or max(screen_px) > 65536:
         raise InputError("must be 1 to 65536", source="--screen-px")
+
+
+def screen_warnings(screen: ScreenPlane, screen_px: tuple[int, int]) -> list[InputWarning]:
+    """Warn of pixels that are more than 2 % from square."""
+    across, down = (mm / px for mm, px in zip(screen.size_mm, screen_px, strict=True))
+    if abs(across / down - 1) < 0.02:
+        return []
+    sizes = f"{screen.size_mm[0]:g} x {screen.size_mm[1]:g} mm"
+    reason = f"{screen_px[0]} x {screen_px[1]} on {sizes} gives pixels of {across:.3g} x {down:.3g} mm, not square"
+    return [InputWarning(code="pixels", reason=reason, source="--screen-px")]
 
 
 class Display(NamedTuple):

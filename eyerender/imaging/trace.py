@@ -29,6 +29,8 @@ from ..scene.spec import MAX_OBSERVATIONS
 from .tracker import Tracker
 
 TRACE_SCHEMA = "eyerender/trace/1"
+COVERED = "occluded by a lid"
+"""Reason of a pupil whose middle is behind a lid."""
 TRUTH = ("azimuth_deg", "elevation_deg", "pupil_mm", "lid_opening_mm", "event", "blink_phase")
 _EVERY_S, _LID_STEP = 0.004, 0.015  # times between openings of open eyes that are computed, and steps of moving lids
 _COLUMNS = 176  # of the lids' edges
@@ -135,7 +137,7 @@ def _on_sensor(seen: Observations) -> Observations:
 
 def _without(seen: Observations, missing: Bools, covered: Bools) -> Observations:
     """Remove the features of rows."""
-    reason = np.where(missing, np.where(covered, "occluded by a lid", "lost"), seen.pupil.reason)
+    reason = np.where(missing, np.where(covered, COVERED, "lost"), seen.pupil.reason)
     return _removed(seen, missing, np.broadcast_to(missing[:, None], seen.glints.status.shape), reason)
 
 

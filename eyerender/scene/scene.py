@@ -431,6 +431,7 @@ class Scene:
             *length_warnings(spec.to_mapping()),
             *vertex_warnings(spec.to_mapping()),
             *(timing_warnings(self.timings) if spec.sequence is not None else ()),
+            *(spec.sequence.warnings(bare=self.region is None) if spec.sequence is not None else ()),
             *place_warnings(rig, eyes, heads, cameras, lights),
             *mirror_warnings(spec.rig.cameras, eyes),
             *self._face_warnings([*zip(cameras, rig.cameras, strict=True)], [*zip(lights, rig.lights, strict=True)]),

@@ -194,3 +194,12 @@ def test_the_command_writes_a_folder_whole_or_not_at_all(scene, tmp_path, capsys
 def test_runs_divide_a_series():
     found = runs(np.array(["a", "a", "b", "a"], dtype=object))
     assert [tuple(run) for run in found] == [("a", 0, 1), ("b", 2, 2), ("a", 3, 3)]
+
+
+def test_lost_samples_neither_make_nor_split_blinks(scene):
+    def blinks(loss):
+        text = asc_text(er.sample_sequence(scene, er.Tracker(rate=500, loss=loss, seed=4)), PX)
+        return [line for line in text.splitlines() if line.startswith("EBLINK")]
+
+    assert len(blinks(0.0)) == 2
+    assert blinks(0.2) == blinks(0.0)

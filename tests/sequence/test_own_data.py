@@ -118,3 +118,17 @@ def test_stored_times_have_offset_and_jitter_and_some_frames_are_lost():
     assert abs(error.mean()) < 3 * 5e-4 / np.sqrt(4000)
     assert abs(error.std() / 5e-4 - 1) < 3 / np.sqrt(2 * 4000)
     assert abs(stamps.dropped(number, camera).mean() - 0.2) < 3 * np.sqrt(0.2 * 0.8 / 4000)
+
+
+def test_short_traces_late_frames_and_lids_without_a_region_are_warned_of(tmp_path):
+    (tmp_path / "times.csv").write_text("# timestamps [seconds],# pts\n100.0,0\n100.5,1\n102.5,2\n")
+    keys = {
+        "duration_s": 2.0,
+        "gaze": {"time_s": [0.0, 0.9], "azimuth_deg": [0, 1], "elevation_deg": [0, 0]},
+        "timestamps": {"file": str(tmp_path / "times.csv")},
+        "lids": {"at_s": [1.0]},
+    }
+    bare = Sequence.from_mapping(keys).resolved()
+    assert [w.path for w in bare.warnings(bare=True)] == [f"sequence.{k}" for k in ("gaze", "timestamps", "lids")]
+    whole = {**keys, "duration_s": 1.5, "timestamps": None}
+    assert Sequence.from_mapping(whole).warnings(bare=False) == []

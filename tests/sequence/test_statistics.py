@@ -92,3 +92,16 @@ def test_torsion_may_be_a_table_beside_the_model():
     table = {"torsion_deg": {"time_s": [0.0, 1.0], "value_deg": [0.0, 5.0]}, **QUIET}
     added = np.degrees(course(gaze=table).at(TIMES[:2000]).torsion_rad - plain.torsion_rad)
     np.testing.assert_allclose(added[[0, 500, 1500], 1], [0.0, 2.5, 5.0], atol=1e-9)
+
+
+def test_fixations_last_as_stated_between_saccades_and_none_is_shorter_than_80_ms():
+    for spread in (0.0, 0.8):
+        for person in range(4):
+            gaze = {"fixation_ms": 300, "fixation_spread": spread, **QUIET}
+            moves = course(person, person, gaze=gaze).at(TIMES).events[:, 2].astype(int)
+            edges = np.flatnonzero(np.diff(moves))
+            lasting = np.diff(edges)[(0 if moves[edges[0]] else 1) :: 2]
+            assert lasting.min() >= 76
+            if not spread:
+                assert np.ptp(lasting) <= 4
+                assert np.mean(lasting) == pytest.approx(300 * Habits.drawn((person,)).fixation, abs=2)

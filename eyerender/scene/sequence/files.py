@@ -21,6 +21,7 @@ MAX_ROWS = 20_000
 """Most rows of a table: 20 s at 1,000 Hz."""
 LATEST_S = 1e10
 """Latest time that a camera may store, s: clocks that count from 1970 are at 1.7e9."""
+_PUPIL = "# timestamps [seconds]"
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "."))
 
 
@@ -49,13 +50,17 @@ def read_columns(
 
 
 def read_times(path: Path) -> Floats:
-    """Read times (n,) s: an .npy file such as Pupil's `eye0_timestamps.npy`, or the column `time_s` of a CSV table.
+    """Read times (n,) s: an .npy file such as Pupil's `eye0_timestamps.npy`, or a column of a CSV table.
+
+    The column is `time_s`, or `# timestamps [seconds]` as Pupil exports it.
 
     Raises:
         InputError: the file cannot be read or holds too many times, or they are not finite.
     """
     if path.suffix.lower() != ".npy":
-        return read_columns(path, {"time_s": "time_s"}, ("time_s",), largest=LATEST_S)["time_s"]
+        first = next(read_table(path), {})
+        name = _PUPIL if _PUPIL in first else "time_s"
+        return read_columns(path, {"time_s": name}, ("time_s",), largest=LATEST_S)["time_s"]
     found = mapped_array(path)
     if found.ndim != 1 or found.dtype.kind not in "iuf" or not 0 < len(found) <= MAX_ROWS:
         raise InputError(f"must be a list of 1 to {MAX_ROWS} times", source=str(path))

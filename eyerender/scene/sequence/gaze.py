@@ -19,6 +19,7 @@ from .spec import Aiming, GazeModel, GazeTable
 
 STEP_S, BEFORE_S = 1e-3, 0.5
 """Step of the grid, and how long before and after a sequence it reaches."""
+_LEAST_S = 0.08  # shortest fixation, so that no two saccades join (the dead time of a saccade is 80 to 100 ms)
 _KNOTS_S = 0.05  # between the times at which a moving eye is aimed
 _KINK_RAD = 1e-5  # change of the torsion's step from one grid point to the next
 _CORRELATED_S = 0.02  # of the velocity of drift
@@ -125,13 +126,10 @@ def model_course(
 
 
 def _fixations(model: GazeModel, times_s: Floats, habits: Habits, rng: np.random.Generator) -> _Fixations:
-    """Draw the fixations that cover the times, a saccade's duration included."""
+    """Draw the fixations that cover the times; each begins with the saccade to it, and lasts from that one's end on."""
     mean = 1e-3 * model.fixation_ms * habits.fixation
-    count = 4 + int((times_s[-1] - times_s[0]) / 0.05)
-    lasting = np.exp(rng.normal(np.log(mean) - model.fixation_spread**2 / 2, model.fixation_spread, count))
-    begin = times_s[0] + np.concatenate([[0.0], np.cumsum(np.maximum(lasting, 0.06))])
-    begin = begin[: np.searchsorted(begin, times_s[-1]) + 1]
-    k = len(begin)
+    k = 4 + int((times_s[-1] - times_s[0]) / _LEAST_S)
+    lasting = np.exp(rng.normal(np.log(mean) - model.fixation_spread**2 / 2, model.fixation_spread, k))
     if model.targets is not None:
         listed = np.array(model.targets, dtype=float)
         turns = np.arange(k) % len(listed) if model.order == "in turn" else _without_repeats(len(listed), k, rng)
@@ -146,7 +144,15 @@ def _fixations(model: GazeModel, times_s: Floats, habits: Habits, rng: np.random
     # A target near the edge of the field turns back.
     inward = -np.sign(target[:, 1:]) * np.abs(np.stack([np.cos(heading), np.sin(heading)], axis=-1))
     velocity = np.concatenate([np.zeros((k, 1)), speed[:, None] * inward], axis=1)
-    return _Fixations(begin, target, velocity, pursued)
+    lasting = np.maximum(lasting, _LEAST_S)
+    # Sizes of saccades as seen from between the eyes; a moving target has moved on by the end of its fixation.
+    seen = np.stack([target[1:], (target + velocity * lasting[:, None])[:-1]])
+    angles = np.arctan2(seen[..., 1:], np.stack([seen[..., 0], np.hypot(seen[..., 0], seen[..., 1])], axis=-1))
+    size = np.degrees(np.hypot(*np.moveaxis(angles[0] - angles[1], -1, 0)))
+    lasting[1:] += duration_s(size) * habits.duration
+    begin = times_s[0] + np.concatenate([[0.0], np.cumsum(lasting)])
+    kept = slice(int(np.searchsorted(begin, times_s[-1])) + 1)
+    return _Fixations(*(part[kept] for part in (begin[:-1], target, velocity, pursued)))
 
 
 def _without_repeats(size: int, count: int, rng: np.random.Generator) -> Ints:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ...base.arrays import Bools, Floats, Ints
-from ...base.errors import InputError
+from ...base.errors import InputError, InputWarning
 from ...base.spec import NonNegative, Number, Positive, Spec, Vec2, Vec3
 from ...rig.screen import ScreenPlane
 from .files import LATEST_S, MAX_ROWS, read_columns, read_times
@@ -150,7 +150,8 @@ class GazeModel(Spec):
     )
     fixation_ms: Annotated[float, Field(ge=50, le=1e6)] = Field(
         default=330.0,
-        description="mean duration of fixations (scenes: 330 ms, Rayner 1998, Psychol. Bull. 124, 372-422)",
+        description="mean duration of fixations between two saccades, times a person's factor; none is shorter than "
+        "80 ms (scenes: 330 ms, Rayner 1998, Psychol. Bull. 124, 372-422)",
     )
     fixation_spread: Annotated[float, Field(ge=0, le=2)] = Field(
         default=0.4, description="standard deviation of the logarithm of their durations (chosen)"
@@ -434,5 +435,28 @@ class Sequence(Spec):
             return
         first, last, end = table.time_s[0], table.time_s[-1], self.duration_s
         if first > end or last < 0.0:
-            reason = f"{first:g} to {last:g} s is outside the sequence, which begins at 0 s and lasts {end:g} s"
+            reason = (
+                f"{first:g} to {last:g} s is outside the sequence, which begins at 0 s of the trace and lasts {end:g} s; "
+                "count from its beginning, and name another unit with unit_s"
+            )
             raise InputError(reason, source=source, path="time_s")
+
+    def warnings(self, *, bare: bool) -> list[InputWarning]:
+        """Warn of tables that cover less than half of it, of frames after its end, and of lids that an eye lacks."""
+        found, end = [], self.duration_s
+        for key in _TABLES:
+            table = getattr(self, key)
+            if isinstance(table, _Table) and len(table.time_s) > 1:
+                first, last = table.time_s[0], table.time_s[-1]
+                if min(last, end) - max(first, 0.0) < end / 2:
+                    reason = f"covers {first:g} to {last:g} s of a sequence of {end:g} s; its ends are held"
+                    found.append(InputWarning(code="coverage", reason=reason, path=f"sequence.{key}"))
+        own = None if self.timestamps is None else self.timestamps.starts_s()
+        if own is not None and own[-1] >= end:
+            reason = f"{np.sum(own >= end)} of {len(own)} are after the sequence's {end:g} s, and have no frame"
+            found.append(InputWarning(code="coverage", reason=reason, path="sequence.timestamps"))
+        quiet = isinstance(self.lids, LidModel) and not (self.lids.rate_hz or self.lids.at_s)
+        if bare and "lids" in self.model_fields_set and not quiet:
+            reason = "covers nothing: the scene has no region, so no lids"
+            found.append(InputWarning(code="lids", reason=reason, path="sequence.lids"))
+        return found
