@@ -8,6 +8,7 @@ The front is a sphere with the base curve F1, so F2 = (1 - n) / R follows for bo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -365,7 +366,7 @@ def _form(value: object) -> str:
 
 def _in_order(lenses: tuple[SpectacleLens, ...]) -> tuple[SpectacleLens, ...]:
     """Refuse a lens that stands within or behind the one before it."""
-    for k, (near, far) in enumerate(zip(lenses, lenses[1:], strict=False), start=1):
+    for k, (near, far) in enumerate(pairwise(lenses), start=1):
         front = near.vertex_mm + near._solved().thickness_mm
         if far.vertex_mm < front:
             reason = f"is {far.vertex_mm:g}, but the lens before it ends at {front:.3g}; list lenses from the eye on"

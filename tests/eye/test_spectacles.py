@@ -273,7 +273,9 @@ def test_a_material_may_be_the_number_that_yaml_reads(given):
 @pytest.mark.parametrize(("place", "warned"), [(3.0, True), (12.0, False)])
 def test_lenses_among_lids_are_warned_of(place, warned):
     for given in ({"vertex_mm": place}, {"right": [{"vertex_mm": place}]}):
-        found = [w for w in scene(spectacles=given).warnings() if w.code == "vertex"]
+        found = [
+            w for w in er.Scene.of(SceneSpec.from_mapping(scene(spectacles=given))).warnings() if w.code == "vertex"
+        ]
         assert bool(found) == warned
         assert all(w.path.startswith("subject.spectacles") and w.path.endswith("vertex_mm") for w in found)
 
