@@ -54,7 +54,7 @@ def features(
     """
     # `observers` would load OpenCV, which is not needed here.
     from ..analytic.observer import AnalyticObserver
-    from ..imaging.gazeseries import screen_warnings
+    from ..imaging.gazeseries import check_screen, screen_warnings
     from ..imaging.labels import space_labels
 
     if points < 6:
@@ -70,6 +70,7 @@ def features(
     heed = Heed(strict)
     loaded = heed.scene(scene, eye=eye)
     if output is not None:
+        check_screen(screen_px)
         if format != "csv" and loaded.rig.screen is not None:
             heed(screen_warnings(loaded.rig.screen, screen_px))
         trace = _sampled(loaded, tracker, output, format, screen_px)
@@ -95,14 +96,12 @@ def _sampled(scene: Scene, tracker: Tracker, output: Path, form: str, screen_px:
     from ..folders.outfolder import refuse_non_empty, staged
     from ..imaging.asc import asc_text
     from ..imaging.bids import write_trace
-    from ..imaging.gazeseries import check_screen
     from ..imaging.trace import sample_sequence
 
     if form == "bids":
         refuse_non_empty(output, False)
     else:
         refuse_special(output)
-    check_screen(screen_px)
     trace = sample_sequence(scene, tracker)
     if form == "bids":
         with staged(output) as folder:

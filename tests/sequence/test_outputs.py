@@ -81,7 +81,10 @@ def test_eyelink_s_events_divide_the_samples(trace, series):
         moving = np.concatenate(
             [np.full(int(b - a) + 1, e[0] == "ESACC") for (a, b), e in zip(spans, ends, strict=True)]
         )
-        hidden = has_event(series[eye].events, "blink") & np.isnan(series[eye].pupil_mm)
+        hidden = np.concatenate(
+            [np.full(int(b - a) + 1, e[0] == "EBLINK") for (a, b), e in zip(spans, ends, strict=True)]
+        )
+        assert np.isnan(series[eye].pupil_mm[hidden]).mean() > 0.9
         np.testing.assert_array_equal(moving, has_event(series[eye].events, "saccade") & ~hidden)
         assert any(e[0] == "EBLINK" for e in ends)
         assert all("." not in e[5:9] for e in ends if e[0] == "ESACC")

@@ -152,7 +152,7 @@ def _fixations(model: GazeModel, times_s: Floats, habits: Habits, rng: np.random
     lasting[1:] += duration_s(size) * habits.duration
     begin = times_s[0] + np.concatenate([[0.0], np.cumsum(lasting)])
     kept = slice(int(np.searchsorted(begin, times_s[-1])) + 1)
-    return _Fixations(*(part[kept] for part in (begin[:-1], target, velocity, pursued)))
+    return _Fixations(begin[:-1][kept], target[kept], velocity[kept], pursued[kept])
 
 
 def _without_repeats(size: int, count: int, rng: np.random.Generator) -> Ints:

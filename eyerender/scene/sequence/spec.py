@@ -436,8 +436,8 @@ class Sequence(Spec):
         first, last, end = table.time_s[0], table.time_s[-1], self.duration_s
         if first > end or last < 0.0:
             reason = (
-                f"{first:g} to {last:g} s is outside the sequence, which begins at 0 s of the trace and lasts {end:g} s; "
-                "count from its beginning, and name another unit with unit_s"
+                f"{first:g} to {last:g} s is outside the sequence, which begins at 0 s and lasts {end:g} s; "
+                "count from the trace's beginning, and name another unit with unit_s"
             )
             raise InputError(reason, source=source, path="time_s")
 
