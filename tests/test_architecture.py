@@ -248,7 +248,7 @@ BOUNDS = {
     "dataset": 11680,  # the codes that cameras stored, labels with validity, mirroring and augmentation, for trainers
     "design": 3930,  # tolerances of units, lids that shade LEDs, blur and motion, LEDs stuck on, for makers of rigs
     "extraction": 6080,
-    "eye": 4560,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
+    "eye": 4570,  # spectacle lenses, their frames, legs of rays, for the same; eyes from biometry, for laboratories
     "folders": 1810,  # compressed depth, normals, lens reflections, for those who train; what damaged videos lack
     "gaze": 5290,  # tables of other trackers; intervals of budgets; precision, for laboratories
     "imaging": 3580,  # one line of metadata for all folders; eyes of cameras; lenses, and the glints they hide

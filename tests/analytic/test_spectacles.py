@@ -321,7 +321,6 @@ def test_the_command_writes_lens_glints_and_refuses_what_does_not_follow(tmp_pat
     assert len(record["lens_glints"]) == 4
     for command in (
         ["features", str(file), "--purkinje", "3"],
-        ["view", "scene", str(file), "-o", str(tmp_path / "v.png")],
         ["rig", str(file), "-o", str(tmp_path / "rig")],
     ):
         capsys.readouterr()
