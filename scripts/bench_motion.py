@@ -186,7 +186,8 @@ def artefacts(people: range) -> Iterator[Row]:
     """
     rig = er.load_scene("eyelink_desktop").spec.rig
     targets = [[700.0, y, z] for z in (-90.0, 20.0, 130.0) for y in (-180.0, 0.0, 180.0)]
-    gaze = {"targets": targets, "fixation_ms": 1000, "fixation_spread": 0.0, "oscillation": False, **ALONE}
+    # Slow people too look at each of nine targets within the ten seconds of the dark that are kept.
+    gaze = {"targets": targets, "fixation_ms": 700, "fixation_spread": 0.0, "oscillation": False, **ALONE}
     light = {"hippus": 0, "luminance": {"time_s": [0.0, 20.0], "cd_m2": [1000.0, 0.3]}}
     sequence = {"duration_s": 50.0, "gaze": gaze, "pupil": light, "lids": {"blinks_per_minute": 0}}
     drawn = er.Population("adults", where={"age_years": (18, 35)}).draw(people.stop, seed=1)
