@@ -9,7 +9,7 @@ temple, one with a camera before and above it, which looks through the upper las
 than half of it is visible, behind lids or lashes. Rows state the share of the glints that labels lose which the report
 on the rig loses too, and the reverse, for each opening of the lids, each rig, and all.
 
-Bare eyes before the first camera follow, once with a ring in the way and once with a lens that sees through an opening.
+People before the first camera follow, once with a ring in the way and once with a lens that sees through an opening.
 Then comes the loss of data of two estimators on its ring of LEDs: 40 adults look in 81 directions up to 20 degrees
 aside and 15 up, and frames without an estimate are compared with those without two glints or a pupil.
 """
@@ -95,7 +95,7 @@ def lost_by_labels(survey: people.RigPopulation, one: people.Someone, reasons: t
 
 
 def obstructed_rows(report: Report, count: int, must: float | None) -> None:
-    """Rows of glints that bare eyes lose behind an obstacle, and behind an opening of the lens."""
+    """Rows of glints, apart from those behind lids and lashes, that an obstacle or an opening of the lens hides."""
     plain = rig_of("below")
     ring = {**plain, "rig": {**plain["rig"], "obstacles": [{"ring": RING}]}}
     for reason, what, scene in (
@@ -105,8 +105,9 @@ def obstructed_rows(report: Report, count: int, must: float | None) -> None:
         survey, labels, rig, both = survey_of(scene, lids=False), 0, 0, 0
         for one in people.people_of(survey, 5, count)[0]:
             exist, lost = lost_by_rig(survey, one)
-            (hidden,) = lost_by_labels(survey, one, (reason,))
-            hidden &= exist
+            hidden, *covered = lost_by_labels(survey, one, (reason, *REASONS))
+            exist &= ~np.any(covered, axis=0)
+            hidden, lost = hidden & exist, lost & exist
             labels, rig, both = labels + hidden.sum(), rig + lost.sum(), both + (hidden & lost).sum()
         report.add(row(f"{what}: glints that labels lose", labels, ""))
         report.add(row(f"{what}: lost by labels, and by rig", both / max(labels, 1), "share", must, at_least=True))
