@@ -220,7 +220,7 @@ def _through_skin(sheet: Sheet, angle: Floats, points: Floats) -> Bools:
     apart = np.abs(c.along[own, None] - c.along) + 2.0 * (c.upper[own, None] == c.upper)
     near = np.stack([own, np.argmin(apart, axis=1)], axis=1)[..., None] + np.arange(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1)
     out = np.zeros(len(angle), dtype=bool)
-    crossed(points, near.reshape(len(angle), -1) % n, sheet.coarse[: MARGIN + LID + 1], out)
+    crossed(points, near.reshape(len(angle), 2 * (2 * _NEAR_COLUMNS + 1)) % n, sheet.coarse[: MARGIN + LID + 1], out)
     return out
 
 
