@@ -142,9 +142,8 @@ def lens_patches(lens: WornLens, name: str, rings: int, sectors: int) -> tuple[P
     for side, outer, inner in (("front", 1.0, lens.index), ("back", lens.index, 1.0)):
         surface = getattr(lens, side)
         points = join(surface.hit(components(start), ways, True).point)
-        out.append(
-            Patch(f"{name}_{side}", points, surface.normal(points), _disc_faces(rings, sectors), outer, inner)
-        )  # fmt: skip
+        faces = _disc_faces(rings, sectors)
+        out.append(Patch(f"{name}_{side}", points, surface.normal(points), faces, outer, inner))
     return *out, _band(f"{name}_edge", _rim(out[0], sectors), _rim(out[1], sectors))
 
 

@@ -40,7 +40,7 @@ class _Eye:
 
     @classmethod
     def of(cls, series: GazeSeries, area: Floats, covered: Bools) -> _Eye:
-        """Call each sample a fixation, a saccade, or a blink between moments at which lids cover the pupil (n,)."""
+        """Label samples as fixation, saccade or blink; `covered` (n,) are those in which lids cover the pupil."""
         moves, blinks = has_event(series.events, "saccade"), has_event(series.events, "blink")
         for _, first, last in runs(np.where(blinks, "blink", "").astype(object)):
             shut = first + np.flatnonzero((covered & blinks)[first : last + 1])

@@ -46,7 +46,8 @@ def on_globe(angle: Floats) -> Floats:
 def meniscus(spec: Region, globe: Globe, sheet: Sheet) -> Floats:
     """Compute vertices (ROWS, columns, 3) of the strip, from the globe to the margin."""
     c = sheet.contour
-    height = spec.tears.height_mm * on_globe(c.angle) * np.where(c.upper > 0, 0.66, 1.0) * step(c.openness, 0.02, 0.25)
+    angle = 2 * np.pi * np.arange(len(c.angle)) / len(c.angle)  # its triangles do not slide with the lower lid
+    height = spec.tears.height_mm * on_globe(angle) * np.where(c.upper > 0, 0.66, 1.0) * step(c.openness, 0.02, 0.25)
     low = np.maximum(1 + 0.8 * spec.tears.unevenness * _noise(spec.seed, len(c.angle), *_LONG), 0.15)
     height = height * low
     # The two menisci must not meet.

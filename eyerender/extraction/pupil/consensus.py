@@ -233,9 +233,9 @@ def _settled(
     """Weight points (n, 2) with normals (n, 2) and refit until the ellipse settles, in compiled code.
 
     Edge points are moved outward by the curvature shift: the steepest place of a blurred convex edge, with the whole
-    smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. Points
-    count the less, the farther they are (FULL and NONE; twice that at first): with a limit at which a weight falls to 0
-    at once, noise would change the ellipse by steps. Returns the number of inliers (fewer than 8: too few; -1: they
+    smoothing sigma, is sigma^2 kappa / 2 inside the true edge. `start` (5,) is centre, semi-axes and angle. The
+    weight of a point falls from 1 at FULL to 0 at NONE tolerances (twice that in the first turn); with a hard limit,
+    noise would change the ellipse in steps. Returns the number of inliers (fewer than 8: too few; -1: they
     span no ellipse), the ellipse (5,), which points are inliers (n,), the moved points (n, 2), and (3,) support, gap
     and residual as in `BoundaryFit`.
     """

@@ -121,9 +121,9 @@ class FrameBuilder:
     ) -> tuple[BoundFrame, Background | RegionScene]:
         """Set up the frame of a job and the surroundings of its eye; both are valid until the next call.
 
-        `lit`: whether to compute light, not only geometry; `after`: the job of the next frame, if known; `before`: a
-        frame a moment ago under the same lamps, whose light from surface to surface is taken over, and that behind the
-        cornea until the eye has turned notably.
+        `lit`: whether to compute light, not only geometry; `after`: the job of the next frame, if known;
+        `before`: the previous frame under the same lamps. Its light between surfaces is reused, and its light behind
+        the cornea too until the eye has turned notably.
         """
         host, surroundings = self._host_data(job)
         region = surroundings if isinstance(surroundings, RegionScene) else None

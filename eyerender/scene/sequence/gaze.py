@@ -126,7 +126,7 @@ def model_course(
 
 
 def _fixations(model: GazeModel, times_s: Floats, habits: Habits, rng: np.random.Generator) -> _Fixations:
-    """Draw the fixations that cover the times; each begins with the saccade to it, and lasts from that one's end on."""
+    """Draw fixations that cover the times. Each begins with its saccade; its duration counts from the saccade's end."""
     mean = 1e-3 * model.fixation_ms * habits.fixation
     k = 4 + int((times_s[-1] - times_s[0]) / _LEAST_S)
     lasting = np.exp(rng.normal(np.log(mean) - model.fixation_spread**2 / 2, model.fixation_spread, k))
