@@ -146,7 +146,7 @@ def numbers_of(folder: Path) -> dict[str, Any]:
     if name == "conditions":
         models = {m["eye_model"]: m["diameters_deg"] for m in summary["models"]}
         return {name: {"mm": summary["pupil_diameters_mm"], "E2": models["E2"],
-                       "people": summary["people"]["diameters_deg"]}}  # fmt: skip
+                       "people": summary["drawn_eyes"]["diameters_deg"]}}  # fmt: skip
     means: dict[str, dict[str, dict[str, float]]] = {}
     for row in summary["rows"]:
         if row["variant"] not in ("index fixed", "vector") or row["mean_deg"] is None:

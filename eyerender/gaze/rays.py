@@ -109,7 +109,7 @@ def chosen_lights(observations: Observations, rig: RigGeometry, lights: Sequence
     each = " for each eye" if any(light.eyes is not None for light in rig.lights) else ""
     if lights is not None and len(wanted) < least:
         raise InputError(f"this estimator needs {least} lights, and {len(wanted)} is named")
-    if len(wanted) < least:
+    if fewest < least:
         raise InputError(f"this estimator needs {least} lights, but the rig has {fewest}{each}")
     if any(k >= fewest for k in wanted):
         raise InputError(f"there is no light {max(wanted)}: the rig has {fewest}{each}, counted from 0")

@@ -653,7 +653,7 @@ class _Reader:
         found = self.glints("purkinje", without="covariance")
         order = np.full(found["light"].shape, -1, np.int64)
         for k, entries in enumerate(rows):
-            for j, one in enumerate(entries if isinstance(entries, list) else ()):
+            for j, one in enumerate(entries[: order.shape[1]] if isinstance(entries, list) else ()):
                 number = one.get("order") if isinstance(one, dict) else None
                 if number not in (1, 2, 3, 4):
                     self.refuse(k, f"purkinje.{j}", "needs order, 1 to 4")
@@ -662,12 +662,13 @@ class _Reader:
         return PurkinjeFeatures(**found, order=order)
 
     def lens_glints(self) -> LensGlintFeatures | None:
-        if all(entries is None for entries in self.values("lens_glints")):
+        rows = self.values("lens_glints")
+        if all(entries is None for entries in rows):
             return None
         found = self.glints("lens_glints")
         surface, index = (np.full(found["light"].shape, -1, np.int64) for _ in range(2))
-        for k, record in enumerate(self.records):
-            for j, one in enumerate(record.get("lens_glints") or ()):
+        for k, entries in enumerate(rows):
+            for j, one in enumerate(entries[: index.shape[1]] if isinstance(entries, list) else ()):
                 name, number = (one.get("surface"), one.get("index")) if isinstance(one, dict) else (None, None)
                 if name not in SURFACES or not _is_count(number):
                     self.refuse(k, f"lens_glints.{j}", "needs surface, front or back, and index, a whole number")

@@ -149,7 +149,7 @@ def test_a_table_may_hold_visibility_subject_and_glints(tmp_path):
         load_labelled(tmp_path)
     table.write_text(f"{head}\na.png,{row},1,anna\n")
     (tmp_path / "glints.csv").write_text("image,x_px,y_px\na.png,85,\n")
-    with pytest.raises(InputError, match="line 2: needs numbers"):
+    with pytest.raises(InputError, match="line 2: needs the name of an image and numbers"):
         load_labelled(tmp_path)
 
 

@@ -21,6 +21,7 @@ from eyerender.cli.main import run
 from eyerender.dataset import run as dataset_run
 from eyerender.dataset.assemble import verify_dataset
 from eyerender.dataset.export import FORMATS, OF_SEQUENCES
+from eyerender.dataset.lines import restore_lines
 from eyerender.dataset.maker import MadeSample, Maker
 from eyerender.dataset.pool import Events
 from eyerender.dataset.shard import verify, write_shard
@@ -197,6 +198,7 @@ def export_case(dataset: Path, layout: str) -> Case:
 def resumed_case(spec: Path, root: Path) -> Case:
     """A run that was killed after its first shard, while the second one was put in place."""
     assert run(["generate", str(spec), str(root / "whole")]) == 0
+    restore_lines(root / "whole")  # as before the dataset was assembled
     assembled = ("dataset.json", "metadata.jsonl", "failures.jsonl", "croissant.json", "README.md")
 
     def begin(place: Path) -> None:

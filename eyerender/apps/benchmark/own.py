@@ -68,12 +68,13 @@ def _glints(folder: Path) -> dict[str, list[TrueGlint]]:
     source = str(folder / GLINTS)
     for k, line in enumerate(read_table(folder / GLINTS, ("image", "x_px", "y_px"), follow=False)):
         try:
-            x, y, light = float(line["x_px"]), float(line["y_px"]), int(line.get("light") or -1)
+            name, x, y = line["image"], float(line["x_px"]), float(line["y_px"])
+            light = int(line.get("light") or -1)
         except (KeyError, ValueError):
-            raise InputError("needs numbers", source=source, path=f"line {k + 2}") from None
+            raise InputError("needs the name of an image and numbers", source=source, path=f"line {k + 2}") from None
         if not (math.isfinite(x + y) and max(abs(x), abs(y)) < 1e5):
             raise InputError("is not a position in an image", source=source, path=f"line {k + 2}")
-        out.setdefault(line["image"], []).append(TrueGlint(light, (x, y)))
+        out.setdefault(name, []).append(TrueGlint(light, (x, y)))
     return out
 
 
@@ -84,7 +85,7 @@ def _of_table(folder: Path) -> Iterator[BenchImage]:
         where = f"line {k + 2}"
         if k >= MAX_IMAGES:
             raise InputError(f"has more than {MAX_IMAGES} lines", source=source)
-        name = line["image"]
+        name = line.get("image", "")
         home = folder / IMAGES if (folder / IMAGES).is_dir() and not name.startswith(f"{IMAGES}/") else folder
         path = _image_or_frame(home, name, videos, (source, where))
         cells = [line.get(column, "") for column in COLUMNS]

@@ -90,7 +90,7 @@ class ConditionsStudy(Study):
                 }
                 for part in _models(parts)
             ],
-            "people": {
+            "drawn_eyes": {
                 "preset": people[0].person["preset"] if people and people[0].person else None,
                 "seed": people[0].person["seed"] if people and people[0].person else None,
                 "diameters_deg": {str(p.person["subject"]): p.diameters for p in people if p.person},
