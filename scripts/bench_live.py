@@ -62,7 +62,9 @@ def latencies(scene: str, backend: str, count: int) -> Iterable[Row]:
         times, rendering = np.array(pairs).T
         yield row(f"{scene}: slider to picture, median", float(np.median(times)), "s", aim=0.3)
         yield row(f"{scene}: slider to picture, 95 %", float(np.percentile(times, 95)), "s", aim=0.5)
-        yield row(f"{scene}: the same, over the time of the rendering", float(np.median(times / rendering)), "", aim=1.5)
+        yield row(
+            f"{scene}: the same, over the time of the rendering", float(np.median(times / rendering)), "", aim=1.5
+        )
 
 
 def memory(scene: str, backend: str, updates: int, warm: int) -> Iterable[Row]:
