@@ -401,7 +401,7 @@ def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> 
     elif screen is None:
         problem = "targets on the screen need a rig with a screen"
     elif unit == "px" and columns.screen_px is None:
-        problem = "targets in px need 'screen_px' (width and height of the screen in px) in --columns"
+        problem = "targets in px need the screen's size in px: --screen-px, or 'screen_px' in --columns"
     elif unit == "fraction" and columns.target_unit is None and (found < -0.2).any():
         problem = "holds negative numbers; say 'target_unit': norm (-1 to 1 from the centre), or fraction"
     if problem is not None or unit is None or screen is None:

@@ -355,7 +355,8 @@ def read_table(
             raise InputError(f"has no column {name}{hint}", source=source)
         for row in filter(None, reader):
             if len(row) > len(header):
-                reason = f"has {len(row)} cells; the header has {len(header)}"
+                hint = "; write decimal points, not commas" if len(row) == 2 * len(header) else ""
+                reason = f"has {len(row)} cells; the header has {len(header)}{hint}"
                 raise InputError(reason, source=source, path=f"line {reader.line_num}")
             yield dict(zip(header, row, strict=False))
     except csv.Error as error:
