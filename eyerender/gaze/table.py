@@ -86,7 +86,7 @@ def _opened(
         given = columns
     else:
         given = CsvColumns.load(columns) if isinstance(columns, str | Path) else CsvColumns.from_mapping(columns)
-    told = str(columns) if isinstance(columns, str | Path) else "columns"
+    source = str(columns) if isinstance(columns, str | Path) else "columns"
     table = _Table.read(path, given.delimiter)
     if of_targets:
         there = {*table.header, None}
@@ -95,7 +95,7 @@ def _opened(
         missing += [] if there.issuperset(own.get("target", ())) else ["target"]
         given = CsvColumns.from_mapping({key: value for key, value in own.items() if key not in missing})
     table.choose_method(given.method)
-    return table, completed(given, table.header, told, table.problems)
+    return table, completed(given, table.header, source, table.problems)
 
 
 @dataclass

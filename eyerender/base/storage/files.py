@@ -213,7 +213,7 @@ def remove_file(path: str | Path) -> None:
 
 
 def remove_parts(path: str | Path) -> None:
-    """Remove temporary files that killed writers of a file left beside it; OSError if a file cannot be removed."""
+    """Remove temporary files left next to a file by writers that were killed; OSError if one cannot be removed."""
     path = Path(path)
     for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
         part.unlink(missing_ok=True)
