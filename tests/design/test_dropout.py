@@ -167,7 +167,7 @@ def test_obstacles_and_openings_cost_the_rig_what_they_cost_features():
     free = np.zeros(COUNT, dtype=bool)
     left, why = people.seen_features(views, theta, rig.cameras[0], (None, survey.occluders), free)
     subject = er.Subject.of(
-        er.Population("adults").person(person, 0), eyes=("right",), ipd_mm=63.0, luminance_cd_m2=20.0,
+        er.Population("adults").person(5, 0), eyes=("right",), ipd_mm=63.0, luminance_cd_m2=20.0,
         accommodation_d=0.0, head_positions_mm=(tuple((one.place_mm - [0.0, -31.5, 0.0]).tolist()),),
     )  # fmt: skip
     poses = er.EyeDirection.listed(survey.directions_deg[CELLS])
