@@ -82,12 +82,13 @@ def folder_of(path, count):
             window = {"x0": x - WIDTH // 2, "y0": y - HEIGHT // 2, "width": WIDTH, "height": HEIGHT}
             write_png(stage / "images" / f"{k}.png", drawn(record, window))
             lines.append({"file_name": "", "window_px": window, "bit_depth": 8, "records": [record]})
+            lines[-1]["parameters"] = {"scene_json": json.dumps(spec.to_mapping())}
         write_dataset(stage, lines, spec=spec.to_mapping(), digest="d")
     with open(path / "metadata.jsonl", "w", encoding="utf-8") as file:
         for k in range(count):
             frame, which = k // 2, k % len(lines)
             line: dict[str, Any] = {**lines[which], "file_name": f"images/{'even' if frame % 10 else which}.png"}
-            line["records"][0]["frame"] = frame
+            line["records"][0] |= {"frame": frame, "instant": frame}
             file.write(json.dumps({"schema": "eyerender/image/5", **line}) + "\n")
     return path
 
