@@ -68,13 +68,7 @@ def run_quickstart(
     timings = []
     if overwrite or not same_run(folder, loaded.digest()):
         render_folder(
-            loaded,
-            folder,
-            backend=backend,
-            threads=threads,
-            overwrite=overwrite,
-            progress=step("rendered"),
-            warn=warn,
+            loaded, folder, backend=backend, threads=threads, overwrite=overwrite, progress=step("rendered"), warn=warn
         )
         timings.append(Timing(f"observing and rendering {count} windows", time.monotonic() - start))
     start = time.monotonic()

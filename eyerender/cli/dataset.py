@@ -16,6 +16,11 @@ from .output import Heed, emit, progress, say
 if TYPE_CHECKING:
     from ..dataset.plan import Plan
 
+Layout = Literal[
+    "webdataset", "imagefolder", "coco", "yolo-seg", "yolo-pose", "csv", "parquet",
+    "labels", "openeds", "ellseg", "teyed", "video", "bids",
+]  # fmt: skip
+
 
 @app.command(name="generate")
 def generate(
@@ -231,21 +236,7 @@ def export_dataset(
     /,
     output: OutputFolder,
     *,
-    format: Literal[
-        "webdataset",
-        "imagefolder",
-        "coco",
-        "yolo-seg",
-        "yolo-pose",
-        "csv",
-        "parquet",
-        "labels",
-        "openeds",
-        "ellseg",
-        "teyed",
-        "video",
-        "bids",
-    ],
+    format: Layout,
     bits: Literal[8, 16] = 8,
     encoding: Literal["stored", "linear", "gamma"] | None = None,
     gain: float | None = None,

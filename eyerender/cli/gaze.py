@@ -42,8 +42,7 @@ def _columns(columns: Path | None, screen_px: tuple[float, float] | None, table:
 
     if screen_px is None or (columns is None and not is_table(table)):
         return columns
-    known = CsvColumns() if columns is None else CsvColumns.load(columns)
-    return known.model_copy(update={"screen_px": screen_px})
+    return (CsvColumns() if columns is None else CsvColumns.load(columns)).model_copy(update={"screen_px": screen_px})
 
 
 @gaze.command(name="fit")

@@ -31,15 +31,7 @@ from ..folders.imagefolder import METADATA, ImageEntry, ImageFolder
 from ..rig.camera import PinholeCamera
 from ..rig.rig import Rig, RigGeometry, RigLike
 from ..scene import Frames, Scene
-from ..scene.observation import (
-    EYES,
-    GlintFeatures,
-    Index,
-    Observations,
-    PoseTruth,
-    PupilFeatures,
-    concatenate,
-)
+from ..scene.observation import EYES, GlintFeatures, Index, Observations, PoseTruth, PupilFeatures, concatenate
 from .capture import EyeImage, render_windows
 
 # Distance of the reflections of a real eye from those of a typical eye that is placed by its pupil.

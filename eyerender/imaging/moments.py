@@ -27,10 +27,7 @@ _SPEEDS_AT = 5  # times at which the motion during an exposure is looked at
 
 
 def moments(
-    frames: RenderableFrames,
-    row: int,
-    middle: RenderJob,
-    job_of: Callable[[RenderableFrames, int], RenderJob],
+    frames: RenderableFrames, row: int, middle: RenderJob, job_of: Callable[[RenderableFrames, int], RenderJob]
 ) -> tuple[SubFrames, ...]:
     """Return the moments of an exposure; empty if nothing moves and every row gets all of its light.
 
@@ -72,10 +69,7 @@ def _at_constant_speed(frames: RenderableFrames, row: int, motion: Motion, middl
 
 
 def _in_sequence(
-    frames: RenderableFrames,
-    row: int,
-    middle: RenderJob,
-    job_of: Callable[[RenderableFrames, int], RenderJob],
+    frames: RenderableFrames, row: int, middle: RenderJob, job_of: Callable[[RenderableFrames, int], RenderJob]
 ) -> tuple[SubFrames, ...]:
     """Divide the exposure of a frame of a sequence at the edges of pulses, and further where the picture moves."""
     from ..rendering.records.job import SubFrames

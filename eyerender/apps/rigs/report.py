@@ -19,15 +19,7 @@ from ...base.arrays import Floats, Ints, finite_or_none
 from ...base.errors import InputError
 from ...base.progress import Progress, notify
 from ...base.storage.files import csv_text, write_json, write_text
-from ...design.crowd import (
-    SHIFTS_MM,
-    coverage_of,
-    covered,
-    figures_of_people,
-    figures_of_shifts,
-    gaze_of,
-    users_of,
-)
+from ...design.crowd import SHIFTS_MM, coverage_of, covered, figures_of_people, figures_of_shifts, gaze_of, users_of
 from ...design.eyebox import eye_box_of, eye_box_text
 from ...design.lids import LEAST_SHARE
 from ...design.noise import FIXATION_DEG, FeatureNoise, extracted_noise, sensor_noise
@@ -194,12 +186,7 @@ def _scene_of(survey: RigPopulation, subject: int, cells: Ints) -> Scene:
 
 
 def summary(
-    scene: Scene,
-    survey: RigPopulation,
-    found: Figures,
-    biases: Sequence[Bias],
-    noise: FeatureNoise,
-    whole: RigGeometry,
+    scene: Scene, survey: RigPopulation, found: Figures, biases: Sequence[Bias], noise: FeatureNoise, whole: RigGeometry
 ) -> dict[str, Any]:
     """Return the content of summary.json; all LEDs of the `whole` rig count for eye safety."""
     side = scene.spec.subject.eyes[0]

@@ -71,12 +71,7 @@ class Rules:
         self.key = protocol, observer
 
     def __call__(
-        self,
-        rule: str,
-        value: float | Values,
-        choose: Callable[..., float] = float,
-        detail: str = "",
-        **words: str,
+        self, rule: str, value: float | Values, choose: Callable[..., float] = float, detail: str = "", **words: str
     ) -> Finding:
         """Test a value, or the one that `choose` (such as `max`) finds among several; `words` go into the statement."""
         if isinstance(value, Mapping):
