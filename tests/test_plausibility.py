@@ -49,7 +49,13 @@ def test_shipped_scenes_give_no_warning(name, eye):
     assert load_scene(name, eye=eye).warnings() == []
 
 
-@pytest.mark.parametrize("name", sorted(shipped_datasets()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ("dataset_quick", "people_two_cameras") else pytest.param(name, marks=pytest.mark.slow)
+        for name in sorted(shipped_datasets())
+    ],
+)
 def test_shipped_datasets_give_no_warning(name):
     assert Plan.load(name).warnings() == []
 

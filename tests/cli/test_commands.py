@@ -51,7 +51,9 @@ def scene(path, angle, lens, targets=2):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("lens", WIDE)
+@pytest.mark.parametrize(
+    "lens", [lens if lens == "fisheye beyond 90 deg" else pytest.param(lens, marks=pytest.mark.slow) for lens in WIDE]
+)
 def test_rendered_features_are_the_analytic_ones(tmp_path, capsys, lens):
     """As close as those of the headset through a pinhole: pixels' noise moves a centre by hundredths of a pixel."""
     path, folder = scene(tmp_path / "scene.yaml", *WIDE[lens]), tmp_path / "out"

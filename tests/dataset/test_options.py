@@ -56,12 +56,11 @@ def test_samples_per_pixel_are_replaced(tmp_path):
         loaded(drawn, spp=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("argv", "shards"),
     [
-        pytest.param(
-            ["--count", "5000000", "--subjects", "1000", "--layout", "webdataset"], 5000, marks=pytest.mark.slow
-        ),
+        (["--count", "5000000", "--subjects", "1000", "--layout", "webdataset"], 5000),
         (["--count", "5000800", "--layout", "webdataset", "--shard-size", "500"], 10002),  # 1645 plans
     ],
 )

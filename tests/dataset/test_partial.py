@@ -89,9 +89,9 @@ def test_a_stopped_shard_goes_on_where_it_was(fresh, whole, tmp_path):
     "harm",
     [
         pytest.param(lambda stage: next((stage / "images").iterdir()).write_bytes(b""), id="picture"),
-        pytest.param(lambda stage: next((stage / "masks").iterdir()).unlink(), id="missing"),
+        pytest.param(lambda stage: next((stage / "masks").iterdir()).unlink(), id="missing", marks=pytest.mark.slow),
         pytest.param(lambda stage: (stage / "shard" / "lines.jsonl").write_bytes(b"{}\n"), id="lines"),
-        pytest.param(lambda stage: (stage / "done.json").write_bytes(b"{"), id="checkpoint"),
+        pytest.param(lambda stage: (stage / "done.json").write_bytes(b"{"), id="checkpoint", marks=pytest.mark.slow),
         pytest.param(
             lambda stage: (stage / "done.json").write_text(
                 (stage / "done.json").read_text().replace('"llvm"', '"cuda"').replace('"digest": "', '"digest": "0')
@@ -109,7 +109,9 @@ def test_a_damaged_checkpoint_or_another_plans_is_not_used(fresh, whole, tmp_pat
     assert tree(tmp_path) == tree(whole)
 
 
-@pytest.mark.parametrize("name", ["images", "masks", "shard"])
+@pytest.mark.parametrize(
+    "name", ["shard", *(pytest.param(name, marks=pytest.mark.slow) for name in ("images", "masks"))]
+)
 def test_a_checkpoint_with_links_is_left_alone(fresh, whole, tmp_path, name):
     victim = tmp_path / "victim"
     victim.mkdir()

@@ -117,7 +117,7 @@ def test_damaged_files_of_the_dataset_are_written_again(tiny, tmp_path, name, co
     assert done["said"] == [f"repairing: {repairs(folder)[0]}"]
 
 
-@pytest.mark.parametrize("content", [None, b'{"schema": "eyerender/'])
+@pytest.mark.parametrize("content", [None, pytest.param(b'{"schema": "eyerender/', marks=pytest.mark.slow)])
 def test_shards_whose_lines_are_lost_are_made_again(tiny, tmp_path, content):
     """A finished dataset holds the lines of its shards once, in metadata.jsonl."""
     folder = shutil.copytree(tiny, tmp_path / "copy")

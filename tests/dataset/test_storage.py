@@ -38,7 +38,7 @@ def folders(tmp_path_factory):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("layout", ["files", "webdataset"])
+@pytest.mark.parametrize("layout", [pytest.param("files", marks=pytest.mark.slow), "webdataset"])
 def test_the_stated_bytes_are_those_of_the_folder(folders, layout, capsys, monkeypatch):
     files = [path for path in (folders / layout).rglob("*") if path.is_file()]
     images = len(ImageFolder.load(folders / layout))
@@ -171,7 +171,7 @@ def made(place, *, half, layout):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("layout", ["files", "webdataset"])
+@pytest.mark.parametrize("layout", ["files", pytest.param("webdataset", marks=pytest.mark.slow)])
 def test_depth_and_normals_take_at_most_six_bytes_of_a_pixel_at_half_precision(tmp_path, layout):
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()

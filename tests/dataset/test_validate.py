@@ -191,7 +191,9 @@ def written(path, name):
     return str(path)
 
 
-@pytest.mark.parametrize("name", ["headset", "people_openeds", "spectacles"])
+@pytest.mark.parametrize(
+    "name", ["spectacles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("headset", "people_openeds"))]
+)
 def test_normals_are_judged_against_their_own_rays(tmp_path, capsys, name):
     folder = tmp_path / "out"
     made = ["generate", written(tmp_path / "d.yaml", name), "-o", str(folder), "--workers", "1", "--count", "1"]

@@ -240,7 +240,7 @@ def test_chi_square_of_fits_of_a_person_over_many_frames(rig):
     assert abs(stats.norm.ppf(stats.chi2.cdf(chi2, dof))) < 2.576
 
 
-@pytest.mark.parametrize("what", ["glints", "outlines"])
+@pytest.mark.parametrize("what", ["glints", pytest.param("outlines", marks=pytest.mark.slow)])
 def test_wrong_features_hardly_matter(what):
     """10 % of the glints, or of the outlines, are wrong by many pixels: error at most 1.5 times as large."""
     frames = frames_of(BARE_HEAD_MOUNTED)
@@ -445,6 +445,7 @@ def test_the_gaze_of_people_is_within_what_is_stated():
         assert er.load_eye("adult").digest() == fit.prior.digest()
 
 
+@pytest.mark.slow
 def test_a_second_camera_does_no_harm():
     """Two oblique cameras near the eye: an outline that the model loses on the way must not stop the fit."""
 
@@ -668,6 +669,7 @@ def test_features_far_outside_every_sensor_are_refused(value):
             fit_eye(replace(seen, **change), frames.scene.rig)
 
 
+@pytest.mark.slow
 def test_the_default_eye_and_priors_are_those_of_drawn_people():
     """Means within a third of the prior's deviation of the eye `adult`, rms within 25 % of it; 40 people a preset."""
 

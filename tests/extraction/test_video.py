@@ -227,7 +227,7 @@ def test_a_video_cannot_be_an_address(tmp_path):
         VideoReader("http://localhost:1/a.mp4")
 
 
-@pytest.mark.parametrize("planted", ["link", "pipe"])
+@pytest.mark.parametrize("planted", [pytest.param("link", marks=pytest.mark.slow), "pipe"])
 def test_a_name_planted_beside_the_overlay_is_not_written_to(still, planted, tmp_path):
     victim, shown = tmp_path / "victim", tmp_path / "ov.mp4"
     victim.write_text("precious")

@@ -478,7 +478,7 @@ def test_unsure_and_displaced_pupils_and_strange_glints_go(clean):
         ("guestrin-eizenman", {}),
         ("hennessey", {}),
         ("direction-regression", {}),
-        ("maximum-likelihood", {}),
+        pytest.param("maximum-likelihood", {}, marks=pytest.mark.slow),
     ],
 )
 def test_an_eighth_of_wrong_records_costs_nothing(scene, clean, name, options):

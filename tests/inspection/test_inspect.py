@@ -282,7 +282,7 @@ def test_a_folder_whose_split_chooses_the_camera_is_named(tmp_path):
     assert ("split train", "camera 1") in pairs
 
 
-RECIPES = ("people_openeds", "dataset_quick")
+RECIPES = (pytest.param("people_openeds", marks=pytest.mark.slow), "dataset_quick")
 MORE = (
     "bench_world",
     "people_nvgaze",

@@ -153,5 +153,5 @@ def test_processes_share_the_folder(place):
         "for turn in range(40): assert np.array_equal(kept(ramp, turn % 4), ramp(turn % 4))"
     )
     environment = {**os.environ, mapcache.LIMIT: "0.03"}  # they remove each other's files all the time
-    runs = [subprocess.Popen([sys.executable, "-c", code], env=environment) for _ in range(3)]
-    assert [run.wait(120) for run in runs] == [0, 0, 0]
+    runs = [subprocess.Popen([sys.executable, "-c", code], env=environment) for _ in range(2)]
+    assert [run.wait(120) for run in runs] == [0, 0]

@@ -252,6 +252,7 @@ def test_calibration_sets_are_what_their_names_say():
     np.testing.assert_allclose(at[134], [800, -247.5, -131.5 - 140])
 
 
+@pytest.mark.slow
 def test_blignaut_part():
     part = BlignautStudy().part(StudyJob(who="E4", protocols=("published", "corrected")))
     assert len(part.rows) == 12 * 6 * 3

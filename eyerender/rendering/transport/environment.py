@@ -27,7 +27,7 @@ from ...base.arrays import Cache, Floats, frozen
 from ...base.errors import InputError
 from ...rig.imaging import RadianceMap
 from ...rig.light import Lamp
-from ..records.frame import upload_array, upload_scalars
+from ..records.frame import aligned_copy, upload_array, upload_scalars
 from ..records.recording import syntax
 from .environmentmap import NORMALS, EnvironmentMap, environment_map, map_rotation, map_values
 
@@ -147,7 +147,7 @@ def _texture(values: NDArray[np.float32]) -> Any:
     # The texture repeats so that the columns wrap. Additional rows separate the poles.
     rows = np.concatenate([values[:1], values, values[-1:]])
     texture: Any = mi.Texture2f
-    return texture(mi.TensorXf(rows), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
+    return texture(mi.TensorXf(aligned_copy(rows)), use_accel=False, wrap_mode=dr.WrapMode.Repeat)
 
 
 @dataclass(kw_only=True)
