@@ -41,11 +41,6 @@ _SHOWN = (
     "lens_back_radius_mm", "kappa_horizontal_deg", "kappa_vertical_deg", "iris_diameter_mm", "ipd_mm",
     "entrance_pupil_mm", "rotation_azimuth_mm", "pupil_nasal_mm", "fissure.width_mm",
 )  # fmt: skip
-_MATRIX = (
-    "refraction_d", "age_years", "axial_length_mm", "corneal_radius_mm", "posterior_radius_mm", "chamber_depth_mm",
-    "lens_thickness_mm", "lens_front_radius_mm", "kappa_horizontal_deg", "iris_diameter_mm", "entrance_pupil_mm",
-    "lens_c0",
-)  # fmt: skip
 _FACE_RIG = {
     "cameras": [{
         "position_mm": [500, 0, -60], "look_at_mm": [0, 0, 0], "focal_length_px": 4400, "resolution_px": [1600, 640],
@@ -81,10 +76,6 @@ class Result:
                 }
                 for m in s.moments
             },
-            "correlations": [
-                {"pair": list(p.pair), "r": p.r, "error": p.error, "expected": p.expected, "source": p.told}
-                for p in s.pairs
-            ],
             "checked": r.n,
             "refused": r.people,
             "reasons": dict(r.reasons),
@@ -215,19 +206,13 @@ def page_of(found: Result, sheet: Image.Image | None) -> Page:
     table, s, r = default_table(), found.statistics, found.refused
     told = [m for m in s.moments if np.isfinite(m.expected_mean)]
     worst = max((max(map(abs, m.errors)) for m in told), default=0.0)
-    pairs = max((abs(p.off) for p in s.pairs), default=0.0)
     largest = max(r.shifts, key=lambda name: abs(r.shifts[name]), default="")
     cards = [
         Card(f"{s.n}", "people drawn"),
         Card(f"{worst:.1f} standard errors", f"largest deviation of {2 * len(told)} means and spreads from the table"),
-        Card(f"{pairs:.1f} standard errors", f"largest deviation of {len(s.pairs)} correlations from the table"),
         Card(f"{r.people} of {r.n}", "people with an eye that physics refuses"),
     ]
     sections = [Section("What was drawn", _lead(found), Figure(_histograms(s), _HISTOGRAMS), _quantities(s, table))]
-    sections.append(
-        Section("Correlations", "Within the right eyes; residuals have no refraction, age and sex in them.",
-                 Figure(_matrix(s), "Correlations of the right eyes as drawn."), _correlations(s))
-    )  # fmt: skip
     if sheet is not None:
         sections.append(Section("Faces", Figure(_picture(sheet), "Right and left eye of the first people.")))
     refused: list[Content] = [
@@ -284,21 +269,6 @@ def _histograms(s: PopulationStatistics) -> str:
         return svg(fig)
 
 
-def _matrix(s: PopulationStatistics) -> str:
-    names = [name for name in _MATRIX if name in s.names]
-    at = [s.names.index(name) for name in names]
-    r = s.correlation[np.ix_(at, at)]
-    with figure(8.4, 7.2) as (fig, ax):
-        ax.imshow(r, cmap="RdBu_r", vmin=-1, vmax=1)
-        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-        ax.set_yticks(range(len(names)), names, fontsize=8)
-        ax.grid(visible=False)
-        for i, j in np.ndindex(r.shape):
-            colour = "white" if abs(r[i, j]) > 0.6 else "black"
-            ax.text(j, i, f"{r[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
-        return svg(fig)
-
-
 def _quantities(s: PopulationStatistics, table: PopulationTable) -> Table:
     rows = [
         (m.name, _number(m.expected_mean), f"{_number(m.mean)} ± {m.mean_error:.1g}", _number(m.expected_sd),
@@ -314,17 +284,6 @@ def _off(m: Moments) -> str:
     return "-" if not np.isfinite(m.expected_mean) else " ".join(f"{e:+.1f}" for e in m.errors)
 
 
-def _correlations(s: PopulationStatistics) -> Table:
-    rows = [
-        (" - ".join(p.pair), f"{p.told:.2f}", f"{p.expected:.3f}", f"{p.r:.3f} ± {p.error:.3f}", f"{p.off:+.1f}",
-         f"{p.mark}: {p.text}")
-        for p in s.pairs
-    ]  # fmt: skip
-    header = ("pair", "source", "joint distribution", "drawn", "off by (standard errors)", "where from")
-    caption = "The source's value may be of residuals; all other values are of the quantities themselves."
-    return Table(header, rows, caption, wide=(5,))
-
-
 def _sources(table: PopulationTable, population: PopulationSpec) -> Table:
     rows = []
     for name, quantity in table.quantities.items():
@@ -336,6 +295,7 @@ def _sources(table: PopulationTable, population: PopulationSpec) -> Table:
             told = table.presets[population.preset].sources
         rows += [(name, source.what, source.mark, source.text) for source in told]
     rows += [(name, "value", constant.mark, constant.text) for name, constant in table.constants.items()]
+    rows += [(" - ".join(pair.pair), "correlation", pair.mark, pair.text) for pair in table.correlations]
     header = ("quantity", "what", "mark", "source")
     return Table(header, rows, "Every number and its source", wide=(3,), folded=True)
 

@@ -43,33 +43,12 @@ class Moments:
         return (self.mean - self.expected_mean) / self.mean_error, (self.sd - self.expected_sd) / self.sd_error
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairStatistic:
-    """Correlation of two quantities of right eyes, drawn and expected, with its source."""
-
-    pair: tuple[str, str]
-    r: float
-    error: float
-    expected: float
-    told: float
-    mark: str
-    text: str
-
-    @property
-    def off(self) -> float:
-        """By how many standard errors it differs from the expected one."""
-        return (self.r - self.expected) / self.error
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class PopulationStatistics:
     """Statistics of n people."""
 
     n: int
     moments: tuple[Moments, ...]
-    pairs: tuple[PairStatistic, ...]
-    names: tuple[str, ...]
-    correlation: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,21 +79,18 @@ def survey(population: PopulationSpec, n: int, seed: int = 0) -> PopulationStati
     centre = np.array([_right(first[name]).mean() for name in names])
     spread = np.array([_right(first[name]).std() for name in names])
     edges = centre[:, None] + spread[:, None] * np.linspace(-_REACH, _REACH, BINS + 1)
-    powers, cross = np.zeros((4, len(names))), np.zeros((len(names), len(names)))
+    powers = np.zeros((4, len(names)))
     counts = np.zeros((len(names), BINS), dtype=np.int64)
     for piece in pieces(population, n, seed):
         x = np.column_stack([_right(piece[name]) for name in names])
         t = (x - centre) / spread
         powers += [np.sum(t**k, axis=0) for k in (1, 2, 3, 4)]
-        cross += t.T @ t
         for k in range(len(names)):
             counts[k] += np.histogram(x[:, k], edges[k])[0]
     m1, m2, m3, m4 = powers / n
     variance = m2 - m1**2
     fourth = m4 - 4 * m1 * m3 + 6 * m1**2 * m2 - 3 * m1**4
     sd_error = np.sqrt(np.maximum(fourth - variance**2, 1e-12) / (4 * n * variance))
-    scale = np.sqrt(np.outer(variance, variance))
-    correlation = (cross / n - np.outer(m1, m1)) / scale
     plain = not population.where
     moments = tuple(
         Moments(
@@ -125,13 +101,7 @@ def survey(population: PopulationSpec, n: int, seed: int = 0) -> PopulationStati
         )
         for k, name in enumerate(names)
     )  # fmt: skip
-    return PopulationStatistics(
-        n=n,
-        moments=moments,
-        pairs=tuple(_pairs(model, names, correlation, n, plain)),
-        names=names,
-        correlation=correlation,
-    )
+    return PopulationStatistics(n, moments)
 
 
 def refusals(population: PopulationSpec, n: int, seed: int = 0, *, progress: Progress | None = None) -> Refusals:
@@ -170,20 +140,3 @@ def _expected(model: Model, name: str, plain: bool) -> tuple[float, float]:
     if not plain or name not in model.distributions:
         return np.nan, np.nan
     return model.expected(name)
-
-
-def _pairs(model: Model, names: tuple[str, ...], correlation: Floats, n: int, plain: bool) -> Iterator[PairStatistic]:
-    for pair in model.reference.table.correlations:
-        if set(pair.pair) <= set(names):
-            i, j = (names.index(name) for name in pair.pair)
-            expected = model.expected_correlation(*pair.pair) if plain else float(correlation[i, j])
-            r = float(correlation[i, j])
-            yield PairStatistic(
-                pair=pair.pair,
-                r=r,
-                error=(1 - r * r) / np.sqrt(n - 1),
-                expected=expected,
-                told=pair.r,
-                mark=pair.mark,
-                text=pair.text,
-            )
