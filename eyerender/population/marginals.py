@@ -15,9 +15,6 @@ from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 from ..base.arrays import Floats
 from ..base.spec import ByKind, Number, Positive, Spec
 
-FARTHEST = 8.0
-"""Standard normal numbers are clipped here; one in 1e15 lies beyond."""
-
 
 class Fixed(Spec):
     """One value for everybody."""

@@ -16,6 +16,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..base.arrays import Floats
 from ..base.errors import InputError, Problems
@@ -327,7 +328,7 @@ def _pose(
         problems.add(f"is given without the {lacks}", has)
         return None, None
     if R.size == 3:
-        R = rotation_of(R.ravel())
+        R = Rotation.from_rotvec(R.ravel()).as_matrix()
     if R.size == 9:
         R = R.reshape(3, 3)
     if R.shape != (3, 3):
@@ -335,14 +336,6 @@ def _pose(
     if t.size != 3:
         problems.add("must be a vector of 3 numbers", t_key)
     return R, t.ravel()
-
-
-def rotation_of(rvec: Floats) -> Floats:
-    """Convert a rotation vector (3,) in radians to a matrix (3, 3) (Rodrigues): I + sin a [k] + (1 - cos a) [k]^2."""
-    angle = float(np.linalg.norm(rvec))
-    x, y, z = rvec / angle if angle > 0 else np.zeros(3)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k))
 
 
 def _size(data: dict[str, tuple[str, Any]], problems: Problems) -> tuple[int, int] | None:

@@ -18,7 +18,7 @@ from eyerender.base.spec import file_digest
 from eyerender.cli.main import run
 from eyerender.dataset.plan import Plan
 from eyerender.dataset.spec import DatasetSpec, shipped_datasets
-from eyerender.rig.opencv import read_opencv, rotation_of
+from eyerender.rig.opencv import calibration_of, read_opencv
 from tests.support.fuzzing import CASES, budget, garbled, proper
 
 K = np.array([[1200.5, 0.0, 322.25], [0.0, 1198.75, 238.5], [0.0, 0.0, 1.0]])
@@ -99,7 +99,9 @@ def test_coefficients_beyond_the_fifth_must_be_zero(tmp_path):
 
 def test_rotation_vectors_are_those_of_opencv():
     for rvec in [*np.random.default_rng(1).uniform(-3, 3, (20, 3)), np.zeros(3), np.array([np.pi, 0, 0])]:
-        np.testing.assert_allclose(rotation_of(rvec), cv2.Rodrigues(rvec)[0], rtol=0, atol=1e-14)
+        found = calibration_of({"K": np.eye(3).tolist(), "rvec": rvec.tolist(), "tvec": [0.0, 0.0, 1.0]}, "")
+        assert found.R is not None
+        np.testing.assert_allclose(found.R, cv2.Rodrigues(rvec)[0], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(

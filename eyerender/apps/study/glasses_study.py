@@ -21,7 +21,6 @@ LACORT, KUEBLER = "Lacort-Beltran et al. 2025, abstract", "Kuebler et al. 2016, 
 SMALL_DEG = 0.1
 """A rise below this counts as none (chosen)."""
 _LEAST = 2  # people of an interval
-_UNKNOWN = "The abstract names neither the calibration nor the estimator"
 _POWERED = ("-6 D", "-3 D", "+3 D", "+6 D")
 _WORDS = {True: "right", False: "wrong", None: "not comparable"}
 _WHY = {
@@ -32,7 +31,6 @@ _WHY = {
     "L4": "Behind +6 D, most glints are not found: they stand a sixth farther apart, among reflections of the lens.",
 }
 """Why a finding may be wrong here."""
-_TICKS = {"cylinder -2 D": "cyl.", "-3 D, tilted": "tilted", g.CUT: "IR cut"}
 _FEATURES = {
     "turn of the eye": "rotation", "size of the pupil": "pupil_size", "pupil moves (px)": "pupil_px",
     "glint moves (px)": "glint_px", "pupils lost": "pupils_lost", "pupils wrong": "pupils_wrong",
