@@ -19,26 +19,26 @@ PACKAGE = Path(eyerender.__file__).resolve().parent
 
 # Lower floors know nothing of higher ones; packages on one floor do not import each other.
 FLOORS = {
-    "base": 2620,
-    "backends": 940,
-    "optics": 5210,
-    "eye": 4560,
-    "region": 4280,
-    "rig": 4630,  # devices of owners; frame rates, shutters and pulses, for those who synchronise cameras
-    "population": 2530,
-    "scene": 4370,  # eyes, lids, pupils and rigs that move, for all who use sequences of frames
-    "folders": 1810,
-    "analytic": 1150,  # eyes behind lenses; features at the time of their own rows, for owners of rolling shutters
-    "rendering": 12620,
-    "extraction": 6080,
-    "design": 3930,
-    "gaze": 5290,
-    "imaging": 3560,  # eyes of cameras; moments of exposures, traces and EyeLink's text, for laboratories
-    "report": 970,
-    "dataset": 11700,
-    "torch": 820,
-    "apps": 19080,  # with studies of networks
-    "cli": 2640,
+    "base": 0,
+    "backends": 1,
+    "optics": 1,
+    "eye": 2,
+    "region": 2,
+    "rig": 2,  # devices of owners; frame rates, shutters and pulses, for those who synchronise cameras
+    "population": 3,
+    "scene": 3,  # eyes, lids, pupils and rigs that move, for all who use sequences of frames
+    "folders": 4,
+    "analytic": 5,  # eyes behind lenses; features at the time of their own rows, for owners of rolling shutters
+    "rendering": 5,
+    "extraction": 5,
+    "design": 6,
+    "gaze": 7,
+    "imaging": 8,  # eyes of cameras; moments of exposures, traces and EyeLink's text, for laboratories
+    "report": 9,
+    "dataset": 9,
+    "torch": 10,
+    "apps": 11,  # with studies of networks
+    "cli": 12,
     "__init__": 13,
     "__main__": 13,
 }
