@@ -105,16 +105,41 @@ def fold_api(app: Sphinx, doctree: nodes.document, page: str) -> None:
         content = name.next_node(addnodes.desc_content)
         if isinstance(name.parent, addnodes.desc_content) or content is None or len(content) < 2:
             continue
-        content.insert(1, nodes.raw("", "<details><summary>Details</summary>", format="html"))
-        content.append(nodes.raw("", "</details>", format="html"))
+        fold(content, 1)
+
+
+LONG_PAGES = ("architecture", "formats", "rig_design", "studies_people_results")
+
+
+def fold_sections(app: Sphinx, doctree: nodes.document, page: str) -> None:
+    """Show heading and first paragraph of each section of a long page, and fold the rest."""
+    if page not in LONG_PAGES:
+        return
+    for section in list(doctree.findall(nodes.section)):
+        starts_with_sections = isinstance(section[1], nodes.section)
+        inside = section.parent.parent if isinstance(section.parent, nodes.section) else None
+        if inside is None or starts_with_sections:
+            continue
+        if isinstance(inside, nodes.section) and not isinstance(section.parent[1], nodes.section):
+            continue
+        texts = [k for k, child in enumerate(section[:4]) if isinstance(child, nodes.paragraph)]
+        if len(section) > 1 + (start := 1 + max(texts[:1], default=0)):
+            fold(section, start)
+
+
+def fold(node: nodes.Element, start: int) -> None:
+    """Fold what a node holds from a position on."""
+    node.insert(start, nodes.raw("", "<details><summary>Details</summary>", format="html"))
+    node.append(nodes.raw("", "</details>", format="html"))
 
 
 def setup(app: Sphinx) -> None:
-    """Register the writer of equations, the lines on the origin of figures, and the folds of the API."""
+    """Register the writer of equations, the lines on the origin of figures, and the folds."""
     app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
     app.connect("source-read", mark_origins)
     app.connect("autodoc-process-docstring", link_pages)
     app.connect("doctree-resolved", fold_api)
+    app.connect("doctree-resolved", fold_sections)
 
 
 # Links to GitHub and to journals change without our doing; `scripts/docs --check-links` lists those that do not answer.

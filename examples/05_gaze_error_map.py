@@ -40,10 +40,9 @@ for ax, (name, observations) in zip(axes, seen.items(), strict=True):
     error = np.degrees(np.linalg.norm(found.point_mm - target, axis=1) / 600)
     print(f"{name}: mean error {np.nanmean(error):.2f} degrees")
     both = error.reshape(-1, 2).mean(axis=1)
-    picture = ax.tricontourf(-target[::2, 1], target[::2, 2], np.nan_to_num(both), levels=8) if len(both) > 6 else None
+    picture = ax.tricontourf(-target[::2, 1], target[::2, 2], np.nan_to_num(both), levels=8)
     ax.plot(-target[::2, 1], target[::2, 2], "w+", ms=4)
     ax.set(title=name, xlabel="to the right on the screen (mm)", aspect="equal")
-    if picture is not None:
-        figure.colorbar(picture, ax=ax, label="error (degrees)", shrink=0.8)
+    figure.colorbar(picture, ax=ax, label="error (degrees)", shrink=0.8)
 axes[0].set_ylabel("up (mm)")
 plt.show()

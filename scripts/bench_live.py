@@ -45,6 +45,12 @@ def opened(driver: Any, address: str) -> None:
     time.sleep(3)
 
 
+def rendering_s(driver: Any) -> float:
+    """Time that the rendering of the shown picture took, from the line below it."""
+    line = driver.execute_script("return document.querySelector('.status').textContent")
+    return int(line.partition("rendered in ")[2].split()[0]) / 1000
+
+
 def latencies(scene: str, backend: str, count: int) -> Iterable[Row]:
     """Rows of one scene."""
     with live_server(scene, "--backend", backend) as server, chromium() as driver:
@@ -52,9 +58,13 @@ def latencies(scene: str, backend: str, count: int) -> Iterable[Row]:
         steps = iter(moves())
         for name, key in islice(steps, 12):
             latency_s(driver, name, key)
-        times = [latency_s(driver, name, key) for name, key in islice(steps, count)]
+        pairs = [(latency_s(driver, name, key), rendering_s(driver)) for name, key in islice(steps, count)]
+        times, rendering = np.array(pairs).T
         yield row(f"{scene}: slider to picture, median", float(np.median(times)), "s", aim=0.3)
         yield row(f"{scene}: slider to picture, 95 %", float(np.percentile(times, 95)), "s", aim=0.5)
+        yield row(
+            f"{scene}: the same, over the time of the rendering", float(np.median(times / rendering)), "", aim=1.5
+        )
 
 
 def memory(scene: str, backend: str, updates: int, warm: int) -> Iterable[Row]:

@@ -274,6 +274,7 @@ def export_dataset(
     """
     from ..dataset.export import export
 
+    heed = Heed(strict=False)
     with progress("exporting") as steps:
         done = export(
             folder,
@@ -288,12 +289,13 @@ def export_dataset(
             screen_px=screen_px,
             overwrite=overwrite,
             progress=steps,
+            warn=heed,
         )
     text = f"{done['images']} images as {format} in {output}"
     if image := done["image"]:  # the layout labels has none
         gained = "" if image["encoding"] == "stored" else f", gain {image['gain']:g}"
         text += f" ({bits} bits, {image['encoding']}{gained})"
-    emit(done, text, json)
+    emit(done, text, json, heed)
     return 0
 
 
@@ -317,8 +319,8 @@ def _shard_lines(plan: Plan) -> list[str]:
     if spec.count >= spec.planned_count or shards < 2 or spec.count / shards >= spec.shard_size / 2:
         return []
     return [
-        f"the {shards} shards hold {spec.count / shards:.1f} samples on average and have gaps in their numbers: "
-        f"a shard has room for {spec.shard_size} of the plan's {spec.planned_count} samples"
+        f"the {shards} shards hold {spec.count / shards:.1f} samples on average; a larger --count fills them, "
+        f"up to {spec.shard_size} each"
     ]
 
 

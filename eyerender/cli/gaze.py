@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
@@ -11,6 +11,9 @@ from ..base.errors import InputError, InputWarning
 from .app import app
 from .options import AtLeastOne, Backend, EstimatorFlags, EstimatorName, EyeModel, OutputFile, Result, Strict, Threads
 from .output import Heed, emit, progress
+
+if TYPE_CHECKING:
+    from ..gaze.columns import CsvColumns
 
 UNITS = ["mm", "px", "deg"]
 PLACES = {
@@ -32,6 +35,17 @@ def _positive(_type: Any, value: tuple[float, float] | None) -> None:
         raise ValueError("must be two numbers > 0")
 
 
+def _columns(columns: Path | None, screen_px: tuple[float, float] | None, table: Path) -> Path | CsvColumns | None:
+    """Add the size of the screen, where it is given, to the meaning of a table's columns."""
+    from ..gaze.columns import CsvColumns
+    from ..gaze.records import is_table
+
+    if screen_px is None or (columns is None and not is_table(table)):
+        return columns
+    known = CsvColumns() if columns is None else CsvColumns.load(columns)
+    return known.model_copy(update={"screen_px": screen_px})
+
+
 @gaze.command(name="fit")
 def fit(
     records: Path,
@@ -43,6 +57,7 @@ def fit(
     rig: str | None = None,
     columns: Path | None = None,
     targets: Path | None = None,
+    screen_px: Annotated[tuple[float, float] | None, Parameter(validator=_positive)] = None,
     options: Annotated[EstimatorFlags, Parameter(name="*")] = EstimatorFlags(),
     strict: Strict = False,
     json: Result = None,
@@ -57,6 +72,7 @@ def fit(
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file with the meaning of a table's columns (default: recognised from their names).
         targets: A table of targets by frame, or by the time from which each is shown.
+        screen_px: Width and height of the screen in px, for targets in px.
     """
     from ..gaze.records import load_observations
     from ..gaze.store import fit_estimator, save_estimator
@@ -65,10 +81,10 @@ def fit(
     chosen, fixations = options.choose(estimator), options.fixation_list()
     heed = Heed(strict)
     observations, built = load_observations(
-        records, None if scene is None else heed.scene(scene), rig=rig, columns=columns
+        records, None if scene is None else heed.scene(scene), rig=rig, columns=_columns(columns, screen_px, records)
     )
     if targets is not None:
-        observations = with_targets(observations, targets, columns, built)
+        observations = with_targets(observations, targets, _columns(columns, screen_px, targets), built)
     fitted, summary = fit_estimator(chosen, observations, built, fixations, source=str(records), warn=heed)
     save_estimator(output, fitted, built)
     summary = {**summary, "path": str(output)}
@@ -126,7 +142,7 @@ def predict(
         rig: A rig file or a scene file, for its rig.
         columns: A YAML file that says what the columns of a table are (default: as their names say).
         output: A table (CSV) of the gaze: time_s, frame, eye, x_px, y_px, x_deg, y_deg, valid.
-        screen_px: Width and height of the screen in px, for errors and gaze in px.
+        screen_px: Width and height of the screen in px, for errors, gaze and targets in px.
     """
     from ..base.storage.files import refuse_special, write_text
     from ..gaze.builtin import BuiltIn
@@ -141,7 +157,7 @@ def predict(
     heed = Heed(strict)
     fitted, calibrated = load_calibration(calibration, estimator)
     observations, built = load_observations(
-        records, None if scene is None else heed.scene(scene), rig=rig, columns=columns
+        records, None if scene is None else heed.scene(scene), rig=rig, columns=_columns(columns, screen_px, records)
     )
     other = [] if calibrated is None else rig_warnings(built, calibrated, scene or rig or str(records))
     heed(other or convention_warnings(observations, built, str(records)))

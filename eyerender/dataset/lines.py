@@ -8,11 +8,16 @@ done.json keeps the checksum of a shard's file, which tells whether metadata.jso
 from __future__ import annotations
 
 import os
+from array import array
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from ..base.arrays import Ints
 from ..base.errors import WRONG, InputError
 from ..base.storage.files import opened, parse_json, written
 from ..base.storage.jsonlines import MAX_BYTES, MAX_LINE_BYTES
@@ -21,33 +26,36 @@ from ..folders.imagefolder import LINES, METADATA, SHARDS, finished, shard_name
 
 @dataclass(frozen=True, slots=True)
 class ShardLines:
-    """Places of lines in a metadata.jsonl: shard -> sample, first byte and length of each, in the shard's order."""
+    """Places of lines in a metadata.jsonl: shard -> (n, 3) sample, first byte, length, in the shard's order."""
 
     path: Path
-    places: dict[int, list[tuple[int, int, int]]]
+    places: dict[int, Ints]
 
     @classmethod
     def index(cls, folder: Path) -> ShardLines:
         """Index the lines of a dataset that name an image of a shard; of an unreadable file, there are none."""
         found = cls(folder / METADATA, {})
+        places: dict[int, array[int]] = defaultdict(lambda: array("q"))
         with suppress(InputError, OSError), opened(found.path, limit=MAX_BYTES, follow=False) as file:
             start = 0
             while text := file.readline(MAX_LINE_BYTES):
                 with suppress(InputError, *WRONG):
                     line = parse_json(text)
                     shard = int(line["file_name"].split("/")[1])
-                    found.places.setdefault(shard, []).append((int(line["sample"]), start, len(text)))
+                    places[shard].extend((int(line["sample"]), start, len(text)))
                 start += len(text)
-        for places in found.places.values():
-            places.sort()
+        for shard, numbers in places.items():
+            rows = np.array(numbers, dtype=np.int64).reshape(-1, 3)
+            found.places[shard] = rows[np.lexsort(rows.T[::-1])]
         return found
 
     def of(self, shard: int) -> Iterator[bytes]:
         """Yield the lines of a shard, as its own file holds them; InputError if metadata.jsonl cannot be read."""
-        with opened(self.path, limit=MAX_BYTES, follow=False) as file:
-            for _, start, length in self.places.get(shard, ()):
-                file.seek(start)
-                yield file.read(length)
+        if shard in self.places:
+            with opened(self.path, limit=MAX_BYTES, follow=False) as file:
+                for _, start, length in self.places[shard].tolist():
+                    file.seek(start)
+                    yield file.read(length)
 
 
 def lines_file(folder: Path, shard: int) -> Path:

@@ -1,6 +1,6 @@
 """Soft contact lenses: a lens that drapes over the cornea, as one more surface in front of it.
 
-The back of the lens takes the shape of the cornea, and the film of tears beneath bends nothing. Bending leaves the
+The back of the lens takes the shape of the cornea, and the tear film beneath bends nothing. Bending leaves the
 thickness of the lens where it is, so its front has the cornea's curvature plus the difference of the curvatures of the
 lens as made, and the cornea's asphericity. The back vertex power as made is F = F1 / (1 - t F1 / n) + F2 with
 F1 = (n - 1) / R_front and F2 = (1 - n) / R_back (Jalie 2021, The Principles of Ophthalmic Lenses, chapter 4). A

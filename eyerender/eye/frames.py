@@ -20,7 +20,7 @@ _TEMPLE_HALF_MM, _HINGE_MM, _TEMPLE_MM, _SPREAD_MM = (2.2, 0.8), 5.0, 110.0, 8.0
 
 
 class SpectacleFrame(Spec):
-    """What holds a lens: a rim along its outline, a bridge to the nose, and a temple to the ear."""
+    """Frame of spectacles: a rim along the outline of the lens, a bridge to the nose, and a temple to the ear."""
 
     rims: bool = Field(default=True, description="whether a rim runs around the lens")
     bridge: bool | None = Field(default=None, description="whether a bar runs to the other lens; default: on the head")

@@ -27,7 +27,7 @@ _REACH = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameShape:
-    """What holds a lens: the keys of `frames.SpectacleFrame`, and the sign of y towards the nose."""
+    """Frame around a lens: the values of `frames.SpectacleFrame`, and the sign of y towards the nose."""
 
     rims: bool
     bridge: bool

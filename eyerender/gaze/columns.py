@@ -114,7 +114,7 @@ _UNIT = re.compile(r"_(px|pixels?|mm|deg|degrees|rad|radians|ms|us|ns|s|norm|fra
 _SIDES = re.compile(r"^(right|left|r|l)_(.*)$|^(.*)_(right|left|r|l)$")
 
 
-def completed(given: CsvColumns, header: list[str], told: str, problems: Problems) -> CsvColumns:
+def completed(given: CsvColumns, header: list[str], source: str, problems: Problems) -> CsvColumns:
     """Complete the given columns by those recognised from their names.
 
     Raises:
@@ -122,7 +122,7 @@ def completed(given: CsvColumns, header: list[str], told: str, problems: Problem
     """
     data = given.to_mapping()
     named = {name for name in _names_in(data) if name is not None}
-    wrong = Problems(told)
+    wrong = Problems(source)
     for name in sorted(named - set(header)):
         wrong.add(f"there is no column {shown(name)}; the columns are {shown(', '.join(header), 200)}")
     wrong.check()

@@ -86,7 +86,7 @@ def _opened(
         given = columns
     else:
         given = CsvColumns.load(columns) if isinstance(columns, str | Path) else CsvColumns.from_mapping(columns)
-    told = str(columns) if isinstance(columns, str | Path) else "columns"
+    source = str(columns) if isinstance(columns, str | Path) else "columns"
     table = _Table.read(path, given.delimiter)
     if of_targets:
         there = {*table.header, None}
@@ -95,7 +95,7 @@ def _opened(
         missing += [] if there.issuperset(own.get("target", ())) else ["target"]
         given = CsvColumns.from_mapping({key: value for key, value in own.items() if key not in missing})
     table.choose_method(given.method)
-    return table, completed(given, table.header, told, table.problems)
+    return table, completed(given, table.header, source, table.problems)
 
 
 @dataclass
@@ -401,7 +401,7 @@ def _targets(table: _Table, columns: CsvColumns, screen: ScreenPlane | None) -> 
     elif screen is None:
         problem = "targets on the screen need a rig with a screen"
     elif unit == "px" and columns.screen_px is None:
-        problem = "targets in px need 'screen_px' (width and height of the screen in px) in --columns"
+        problem = "targets in px need the screen's size in px: --screen-px, or 'screen_px' in --columns"
     elif unit == "fraction" and columns.target_unit is None and (found < -0.2).any():
         problem = "holds negative numbers; say 'target_unit': norm (-1 to 1 from the centre), or fraction"
     if problem is not None or unit is None or screen is None:

@@ -74,7 +74,7 @@ class EyeImage:
 
     @property
     def lens_reflections(self) -> Bytes:
-        """Where lenses mirror more light than comes from behind them, (height, width): 1, else 0."""
+        """1 where lenses mirror more light than comes from behind them, else 0, (height, width)."""
         found = self.rendered.lens_reflections
         return np.zeros(self.parts.shape, np.uint8) if found is None else np.asarray(found, np.uint8)
 
@@ -131,7 +131,7 @@ def render_windows(
     check_windows(frames.scene)
     if renderer is None:
         renderer = make_renderer(backend, threads)
-    images = (begun.image() for begun in one_behind(begin_each([frames], renderer)))
+    images = (frame.image() for frame in one_behind(begin_each([frames], renderer)))
     yield from followed_by(images, len(frames), progress, "images", COMPILING)
 
 

@@ -121,7 +121,8 @@ class Comparison:
         if gaze is None:
             lines.append(f"gaze: none ({data['gaze_reason']})")
         else:
-            lines.append(f"gaze error, degrees ({gaze['estimator']}, {gaze['protocol']})     mean      max     n")
+            lines.append(f"gaze error, degrees ({gaze['estimator']}, {gaze['protocol']})")
+            lines.append(f"  {'observer':<10} {'mean':>8} {'max':>8} {'n':>5}")
             for key in ("analytic", "image"):
                 d = gaze[key]
                 if d is None:

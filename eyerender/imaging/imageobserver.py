@@ -396,8 +396,8 @@ def detect(
         settings: settings of the extraction.
     """
     several = [images] if isinstance(images, EyeImage) else images
-    told = (replace(image, frame=image.frame.seen_by(rig)) for image in several)
-    return ImageObserver(settings=settings or ExtractionSettings()).observe_images(told)
+    on_rig = (replace(image, frame=image.frame.seen_by(rig)) for image in several)
+    return ImageObserver(settings=settings or ExtractionSettings()).observe_images(on_rig)
 
 
 def rigs_of(folder: ImageFolder) -> list[RigGeometry]:

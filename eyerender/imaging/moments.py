@@ -127,7 +127,7 @@ def _in_sequence(
 
 
 class _Labelled:
-    """Which rows of a rolling shutter have the raster labels of which moment: the one nearest to the row's light."""
+    """Assigns each row of a rolling shutter the raster labels of the moment nearest to its light."""
 
     def __init__(self, lit_s: Floats, times_s: Floats, counts: list[int], *, moves: bool) -> None:
         self.first = np.cumsum([0, *counts])

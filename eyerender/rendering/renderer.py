@@ -173,7 +173,7 @@ def _lamps(job: RenderJob) -> tuple[float, ...]:
 
 
 class _Film:
-    """Pictures of moments, which differ from the first one under the same lamps in their moving part and rows alone.
+    """Renders the moments of an exposure; under the same lamps, they differ only in what moves and in their rows.
 
     Args:
         spp: samples per pixel of the whole exposure.

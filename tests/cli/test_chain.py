@@ -87,7 +87,8 @@ def test_what_a_dataset_leads_to(spec, tmp_path, monkeypatch, ends):
         ends(command, "out")
     ends("bench-extractors", "out", "-o", "bench")
     for layout in FORMATS:
-        ends("export-dataset", "out", layout, "--format", layout, reasons=("is not of the layout webdataset", "no frame of a sequence"))
+        unfit = ("is not of the layout webdataset", "no frame of a sequence")
+        ends("export-dataset", "out", layout, "--format", layout, reasons=unfit)
     ends("generate", spec, "-o", "out", "--count", 3, "--workers", 1)
     ends("validate", "out")
     ends("merge", "out", "-o", "merged")

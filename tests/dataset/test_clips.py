@@ -26,6 +26,7 @@ def spec(**changes):
     for camera in scene["rig"]["cameras"]:
         camera["frame_rate_hz"] = 50.0
     scene["rig"]["lights"] = scene["rig"]["lights"][:1]
+    scene["rig"]["screen"] = {"centre_mm": [600.0, 0.0, 0.0], "size_mm": [480.0, 270.0]}
     scene["sensor"]["exposure_ms"] = 1.0  # few moments of motion blur
     scene |= {
         "image": {"spp": 1, "window_px": [48, 40]},
@@ -171,6 +172,14 @@ def _without_times(folder):
     for line in lines:
         line["records"][0]["time_s"] = None
     (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_the_command_warns_of_a_screen_whose_pixels_are_not_square(made, tmp_path, capsys):
+    command = ["export-dataset", str(made / "out"), "--format", "bids"]
+    assert run([*command, str(tmp_path / "square")]) == 0
+    assert "warning" not in capsys.readouterr().err
+    assert run([*command, str(tmp_path / "other"), "--screen-px", "1920", "1200"]) == 0
+    assert capsys.readouterr().err.count("0.25 x 0.225 mm, not square") == 1
 
 
 HARMS = (_without_a_line, _with_half_a_line, _without_times, _with_half_a_picture, _without_a_picture)

@@ -106,6 +106,25 @@ def test_a_table_may_hold_one_glint_in_a_row(tmp_path):
     assert_recording(observations_from_csv(write(tmp_path / "t.csv", header, rows)))
 
 
+def test_fit_and_predict_take_the_size_of_the_screen_for_targets_in_pixels(tmp_path, capsys):
+    seen, rig = recording()
+    size = np.array(rig.screen.size_mm)
+    rows = []
+    for i in range(len(seen)):
+        spot = (rig.screen.flat(seen.index.target_mm[i]) * (1, -1) / size + 0.5) * (1280, 1024)
+        rows.append([seen.index.frame[i], EYES[seen.index.eye[i]], *row_of(seen, i), *spot.tolist()])
+    header = "frame eye pupil_x pupil_y glint0_x glint0_y glint1_x glint1_y target_x_px target_y_px"
+    table = str(write(tmp_path / "t.csv", header, rows))
+    end = ["--rig", "guestrin2006", "--json", str(tmp_path / "out.json")]
+    fit = ["gaze", "fit", table, "--estimator", "regression", "-o", str(tmp_path / "c.json"), *end]
+    assert run(fit) == 2
+    assert "--screen-px" in capsys.readouterr().err
+    assert run([*fit, "--screen-px", "1280", "1024"]) == 0
+    assert json.loads((tmp_path / "out.json").read_text())["calibration_error_mm"]["mean_mm"] < 10
+    predict = ["gaze", "predict", table, "-c", str(tmp_path / "c.json"), *end]
+    assert run([*predict, "--screen-px", "1280", "1024"]) == 0
+
+
 def test_columns_of_any_name_are_told_by_a_file(tmp_path):
     seen, rig = recording()
     w, h = rig.screen.size_mm
@@ -316,7 +335,7 @@ BAD: list[tuple[str, list[list[Any]], dict[str, Any], list[str]]] = [
     (f"eye {P}", [["r", 1, 2], ["l", 1, 2]], {}, ["needs a column frame or time"]),
     (f"frame eye {P}", [[1, "third", 1, 2]], {}, ["line 2.eye: must be right or left, not 'third'; say in 'eyes'"]),
     (f"{P} target_x target_y", [[1, 2, 3, 4]], {}, ["target_x, target_y: the unit is not known; say 'target_unit'"]),
-    (f"{P} target_x_px target_y_px", [[1, 2, 3, 4]], {}, ["targets in px need 'screen_px'"]),
+    (f"{P} target_x_px target_y_px", [[1, 2, 3, 4]], {}, ["targets in px need the screen's size in px: --screen-px"]),
     (f"{P} diameter", [[1, 2, -3]], {}, ["line 2.diameter: must be > 0"]),
     ("frame light glint_x glint_y", [[1, 0, 1, 2], [1, 0, 3, 4], [1, "", 3, 4]], {}, [
         "line 4.light: is empty, but the row holds a glint", "line 3.light: light 0 has a glint in this frame already",

@@ -90,7 +90,7 @@ def test_a_picture_is_shown_at_once_and_grows_better(painter, setup):
 
 def test_bands_and_passes_give_the_picture_of_the_renderer(painter, blurry, monkeypatch):
     monkeypatch.setattr("eyerender.apps.live.painter.BUDGET_S", 0.0)
-    monkeypatch.setattr("eyerender.apps.live.painter.BAND_PX", 4000)
+    monkeypatch.setattr("eyerender.apps.live.painter.BAND_SAMPLES", 16_000)
     tab = Tab(painter, "f")
     tab.ask(order(1, blurry, extract=False))
     while (shown := tab.next()).samples < 16:

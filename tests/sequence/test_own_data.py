@@ -65,6 +65,8 @@ def test_targets_of_a_file_are_fixated(tmp_path):
     [
         ("time,azimuth_deg\n0,1\n", "has no column time_s"),
         ("time_s;azimuth_deg;elevation_deg\n0;1;2\n", "separated by ';', not by commas"),
+        ("time_s,azimuth_deg,elevation_deg\n0,0,1,5,2,5\n", "has 6 cells; the header has 3; write decimal points"),
+        ('time_s,azimuth_deg,elevation_deg\n"0,5",1,2\n', "'0,5' is not a number up to .*; write a decimal point"),
         ("time_s,azimuth_deg,elevation_deg\n15,1,2\n16,1,2\n", "15 to 16 s is outside the sequence"),
         ("time_s,azimuth_deg\n0,1\n", "give either azimuth_deg and elevation_deg, or target_mm"),
         ("time_s,azimuth_deg,elevation_deg\n0,a,0\n", "'a' is not a number"),

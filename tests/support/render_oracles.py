@@ -39,7 +39,7 @@ def mirrored_share(cosine: np.ndarray, before: float, behind: float, film: float
 
 
 def corneal_share(cosine: np.ndarray, eye: EyeModel) -> np.ndarray:
-    """Reflectance of an eye's front under its film of tears."""
+    """Reflectance of an eye's front under its tear film."""
     return mirrored_share(cosine, 1.0, float(eye.front_indices[0]), TEARS.index(eye.wavelength_nm))
 
 

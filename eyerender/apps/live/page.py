@@ -112,7 +112,7 @@ class Studio:
         """Add the page and its images to NiceGUI's application."""
 
         @app.get("/picture/{key}")  # type: ignore[untyped-decorator]
-        def picture(key: str) -> Response:
+        async def picture(key: str) -> Response:
             tab = self.tabs.get(key)
             if tab is None or tab.shown is None:
                 return Response(status_code=404)

@@ -51,8 +51,8 @@ PREVIEW_PX = (20_000, 160_000, 640_000)
 """Pixels of a preview: the fewest, those of the first one, and the most."""
 REST_S = 0.25
 """Time without changes after a preview before its image is refined."""
-BAND_PX = 20_000
-"""Fewest pixels of a band, because preparing a band takes time."""
+BAND_SAMPLES = 640_000
+"""Fewest samples of a band: rendering these takes about as long as preparing a band."""
 MAX_REASON = 300
 
 
@@ -260,7 +260,7 @@ class Painter:
         job = _job(frame, canvas.samples + 1)
         x0, y0, width, height = job.window
         spp = max(PREVIEW_SPP, canvas.samples)
-        rows = max(1, min(height, max(BAND_PX, int(BUDGET_S / (self._sample_s * spp))) // width))
+        rows = max(1, min(height, int(max(BAND_SAMPLES, BUDGET_S / self._sample_s)) // (spp * width)))
         taken = np.zeros((height, width))
         began = time.perf_counter()
         for top in range(0, height, rows):

@@ -16,7 +16,7 @@ from .drawing import Label, Strokes, colours_of, extent_mm
 _CM = 0.1
 """The view's unit is 1 cm, which suits its near plane and mouse wheel."""
 _FIELD_DEG = 40.0
-_IDLE_FPS, _TURNED_FPS = 8, 30
+_IDLE_FPS, _TURNED_FPS = 4, 30
 
 
 class Segments(Object3D, component="segments.js"):  # type: ignore[call-arg]

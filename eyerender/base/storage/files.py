@@ -213,7 +213,7 @@ def remove_file(path: str | Path) -> None:
 
 
 def remove_parts(path: str | Path) -> None:
-    """Remove temporary files that killed writers of a file left beside it; OSError if a file cannot be removed."""
+    """Remove temporary files left next to a file by writers that were killed; OSError if one cannot be removed."""
     path = Path(path)
     for part in path.parent.glob(f".{glob.escape(path.name)}.*{PART}"):
         part.unlink(missing_ok=True)
@@ -355,7 +355,8 @@ def read_table(
             raise InputError(f"has no column {name}{hint}", source=source)
         for row in filter(None, reader):
             if len(row) > len(header):
-                reason = f"has {len(row)} cells; the header has {len(header)}"
+                hint = "; write decimal points, not commas" if len(row) == 2 * len(header) else ""
+                reason = f"has {len(row)} cells; the header has {len(header)}{hint}"
                 raise InputError(reason, source=source, path=f"line {reader.line_num}")
             yield dict(zip(header, row, strict=False))
     except csv.Error as error:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...base.errors import WRONG, InputError
+from ...base.errors import WRONG, InputError, Warn
 from ...base.progress import Progress, notify
 from ...base.storage.files import write_json, write_text
 from ...folders.exported import EXPORT
@@ -71,6 +71,7 @@ def export(
     screen_px: tuple[int, int] = SCREEN_PX,
     overwrite: bool = False,
     progress: Progress | None = None,
+    warn: Warn | None = None,
 ) -> dict[str, Any]:
     """Write a folder of labelled images in another layout; on an error, nothing is left behind.
 
@@ -94,6 +95,7 @@ def export(
         screen_px: width and height of the picture on the scene's screen, on which `bids` states the gaze.
         overwrite: replace the contents of `out`.
         progress: called with images done, images in all and "images".
+        warn: receives a warning if the pixels of the screen are not square.
 
     Raises:
         InputError: the layout or encoding is unknown, the folder is of another kind, a checksum is wrong,
@@ -118,7 +120,7 @@ def export(
 
     step(0)
     items = Items(folder, step, workers=workers, shuffle=shuffle)
-    items.speed, items.screen_px = speed, screen_px
+    items.speed, items.screen_px, items.warn = speed, screen_px, warn or items.warn
     with staged(out, overwrite=overwrite) as stage, _labels_as_made(items):
         items.survey()
         if format not in _PICTURELESS:

@@ -22,7 +22,7 @@ import numpy as np
 from ...base.storage.files import write_text
 from ...folders.exported import EXPORT
 from ...imaging.bids import Recording, write_dataset, write_recording
-from ...imaging.gazeseries import Display, GazeSeries, places_of
+from ...imaging.gazeseries import Display, GazeSeries, places_of, screen_warnings
 from ...rig.screen import Screen
 from .item import Items
 from .recordings import Moment, Recordings, moment_of
@@ -39,6 +39,8 @@ def write(items: Items, out: Path) -> None:
             return
         first = {eye: min(camera for camera, side in current if side == eye) for _, eye in current}
         series = [_series(current[camera, eye], items.screen_px) for eye, camera in first.items()]
+        for one in series:
+            items.warn([] if one.display is None else screen_warnings(one.display.plane, items.screen_px))
         write_recording(out, Recording(key[0] + 1, key[1], items.name), series)
         current.clear()
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.arrays import Bytes, Floats, Ints
-from ...base.errors import WRONG, InputError
+from ...base.errors import WRONG, InputError, Warn
 from ...base.processes import ordered
 from ...base.storage.files import parse_json
 from ...folders.imagefile import image_of, png_bytes
@@ -192,6 +192,7 @@ class Items:
         encoding: encoding of the export.
         speed: how fast videos to look at run; 1 is the speed of the recording.
         screen_px: width and height of the picture on a scene's screen.
+        warn: receives what is probably a mistake.
         order: (n,) row in metadata.jsonl of each image, in the order of the export.
         images_by_split: number of images of each split, by name.
         bit_depths: bit depths of the images.
@@ -209,6 +210,7 @@ class Items:
         self.folder, self.step, self.workers, self.shuffle = folder, step, workers, shuffle
         self.encoding = STORED
         self.speed, self.screen_px = 1.0, SCREEN_PX
+        self.warn: Warn = lambda _: None
         self.order: Ints = np.arange(len(folder.entries))
         self.images_by_split: dict[str, int] = {}
         self.bit_depths: set[int] = set()

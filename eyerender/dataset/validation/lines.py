@@ -198,7 +198,7 @@ def hashed(data: bytes) -> int:
 def compare_lines(images: ImageFolder, problems: FolderProblems) -> None:
     """Compare the lines of each shard in metadata.jsonl with those that were made, whatever the order of shards.
 
-    A folder of packed shards, or of an unfinished run, has no metadata.jsonl. The lines of one shard are in memory.
+    A folder of packed shards, or of an unfinished run, has no metadata.jsonl. One line is in memory at a time.
     """
     if images.unfinished or images.dataset["schema"] != DATASET_SCHEMA:
         return
@@ -211,7 +211,10 @@ def compare_lines(images: ImageFolder, problems: FolderProblems) -> None:
         try:
             done = read_done(images.path, shard)
             sums = done["files"].get(f"{SHARDS}/{shard_name(shard)}/{LINES}", {})
-            if hashlib.sha256(b"".join(lines.of(shard))).hexdigest() != sums.get("sha256"):
+            found = hashlib.sha256()
+            for text in lines.of(shard):
+                found.update(text)
+            if found.hexdigest() != sums.get("sha256"):
                 said = "differ from what was made" if count == done["images"] else f"are {count}, not {done['images']}"
                 problems.add(f"{METADATA}: the lines of shard {shard} {said}")
         except InputError:

@@ -76,7 +76,7 @@ class HostData:
 
     @cached_property
     def lit_through(self) -> Bools:
-        """Which lamps light the eye through worn lenses."""
+        """True for each lamp that lights the eye through worn lenses, (n,)."""
         lenses = self.job.turned_lenses
         return self.lamps.lit_through(lenses) if lenses else np.zeros(len(self.lamps), dtype=bool)
 

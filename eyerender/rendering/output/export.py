@@ -148,7 +148,7 @@ def _notes(job: RenderJob) -> list[str]:
     if any(lamp.radius_mm == 0 for lamp in job.lights):
         notes.append("Point lamps: a path tracer cannot light what lies behind the cornea with them.")
     if job.look.tear_film:
-        notes.append(f"The film of tears on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
+        notes.append(f"The tear film on the cornea is a dielectric layer of its own, {_FILM_MM} mm thick.")
     if job.ambient.model_copy(update={"sun": None}) != Ambient():
         notes.append("Even light, panels and the surrounding's map are left out.")
     if any(lens.reflectances or lens.transmission < 1 for lens in job.eye.worn):

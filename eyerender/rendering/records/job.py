@@ -421,7 +421,7 @@ class LampTable(ArrayValue):
 
     @property
     def points_on_relief(self) -> int:
-        """The same for the relief of the iris, whose own shadows are softer than those of all but wide lamps."""
+        """Number of points that represent each lamp on the iris relief, whose own shadows are soft."""
         return 1 if self.widest < _NARROW else 4
 
     @property

@@ -76,5 +76,6 @@ def _number(cell: str, name: str, path: Path, largest: float) -> float:
     except ValueError:
         value = np.nan
     if not abs(value) <= largest:
-        raise InputError(f"{shown(cell)} is not a number up to {largest:g}", source=str(path), path=name)
+        hint = "; write a decimal point, not a comma" if "," in cell else ""
+        raise InputError(f"{shown(cell)} is not a number up to {largest:g}{hint}", source=str(path), path=name)
     return value

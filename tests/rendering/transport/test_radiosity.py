@@ -100,7 +100,7 @@ def test_an_even_sky_lights_sclera_surround_and_iris_as_in_the_stock_path_integr
 
     from eyerender.rendering.output.export import export_scene
 
-    # It grows with a film of tears, whose mirror has an oracle of its own, so there is none here.
+    # It grows with a tear film, whose mirror has an oracle of its own, so there is none here.
     bare = FLAT.model_copy(update={"tear_film": False})
     job = job_of(
         eye_of(model), remote(48, 26.0, ()), (0, 0, 48, 48), look=bare, ambient=Ambient(irradiance_w_m2=1e3 * np.pi)

@@ -21,7 +21,7 @@ from tests.support.render_rigs import BLACK, PLAIN, LampRig, eye_of, job_of
 
 pytestmark = [pytest.mark.render, pytest.mark.timeout(1800)]
 
-# The exported scene has no soft rims, and no light inside tissue or through the limbus. The film of tears has an oracle
+# The exported scene has no soft rims, and no light inside tissue or through the limbus. The tear film has an oracle
 # of its own.
 BARE = {"limbus_width_mm": 0.0, "tear_film": False, "limbus_transmittance": 0.0, "scattering": None}
 FLAT = PLAIN.model_copy(update={**BARE, "pupil_albedo": 0.0})
