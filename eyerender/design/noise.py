@@ -111,8 +111,9 @@ def sensor_noise(
 def extracted_noise(scene: Scene, *, fixation_deg: float = FIXATION_DEG) -> FeatureNoise:
     """Compute the noise of the features that `extract` finds, for pupils that are no ellipses; equation (2b).
 
-    Lamps light the iris obliquely, and it is darker beside the pupil. Glints lie on the iris; the factor 1.1 of their
-    noise was fitted to rendered frames. `scripts/bench_noise.py` compares both with frames of other people and rigs.
+    Lamps light the iris obliquely, and it is darker beside the pupil, which has the light of the lens' glare alone.
+    Glints lie on the iris; the factor 1.1 of their noise was fitted to rendered frames. `scripts/bench_noise.py`
+    compares both with frames of other people and rigs.
     """
     return _noise_of(scene, True, fixation_deg, scene.rig.lights)
 
@@ -121,7 +122,7 @@ def _noise_of(scene: Scene, extracted: bool, fixation_deg: float, lights: Sequen
     """Compute the noise of features from the sensor alone, or as they are extracted."""
     rig, sensor = scene.rig, scene.spec.sensor
     read = read_noise_e(sensor)
-    edge_noise = ridge_deviation if extracted else edge_deviation
+    pupil_share = scene.spec.lens.glare if extracted else PUPIL_SHARE
     outline, glint = np.empty(len(rig.cameras)), np.full((len(rig.cameras), len(lights)), np.inf)
     for k, camera in enumerate(rig.cameras):
         side = next(filter(camera.sees, scene.spec.subject.eyes), scene.spec.subject.eyes[0])
@@ -132,13 +133,15 @@ def _noise_of(scene: Scene, extracted: bool, fixation_deg: float, lights: Sequen
         iris = float(electrons(sensor, radiance_to_irradiance(sensor) * np.asarray(radiance), scene.spec.wavelength_nm))
         if extracted:
             iris *= BESIDE_PUPIL * oblique_share(list(lit.values()), eye_mm)
-        dark = PUPIL_SHARE * iris
+        dark = pupil_share * iris
         behind = iris if extracted else dark
         blurs = blurs_px(scene, camera, eye_mm)
         blur = float(np.sqrt(np.mean(blurs**2)))
-        outline[k] = np.sqrt(
-            np.mean([edge_noise(dark, iris, b, read, sensor.full_well_e) ** 2 for b in blurs.tolist()])
-        )
+        if extracted:
+            outline[k] = ridge_deviation(dark, iris, blurs, read, sensor.full_well_e)
+        else:
+            parts = [edge_deviation(dark, iris, b, read, sensor.full_well_e) for b in blurs.tolist()]
+            outline[k] = np.sqrt(np.mean(np.square(parts)))
         for j, lamp in lit.items():
             energy, size = glint_energy(lamp, camera, eye_mm, sensor, scene.spec.wavelength_nm)
             spread = float(np.hypot(blur, size))
@@ -208,19 +211,22 @@ def edge_deviation(low_e: float, high_e: float, blur_px: float, read_e: float, w
     return float(1.0 / np.sqrt(information)) if information > 0 else np.inf
 
 
-def ridge_deviation(low_e: float, high_e: float, blur_px: float, read_e: float, well_e: float = np.inf) -> float:
+def ridge_deviation(low_e: float, high_e: float, blur_px: ArrayLike, read_e: float, well_e: float = np.inf) -> float:
     """Compute the standard deviation (px) of one px of an edge from the gradient's ridge, equation (2b).
 
     The extractor's filter is 1 px wide for a clear edge, up to 2.5 px for a noisy one, and as wide as a blur of more
-    than 1.7 times that. The arguments are those of `edge_information`.
+    than 1.7 times that, all around the pupil. The arguments are those of `edge_information`, but for several blurs (n,)
+    of equal parts of the outline, whose variances are averaged.
     """
+    blur2 = np.square(blur_px)
     low, high = min(low_e, well_e), min(high_e, well_e)
     if high <= low:
         return np.inf
     ratio = float(np.sqrt((low + high) / 2.0 + read_e**2)) / (high - low)
     width = min(max(9.0 * ratio, 1.0), 2.5)
-    width = blur_px if blur_px > 1.7 * width else width
-    return float(np.sqrt(0.75 * np.sqrt(np.pi) * (blur_px**2 + width**2) ** 3 / width**5)) * ratio
+    blur = float(np.sqrt(np.mean(blur2)))
+    width = blur if blur > 1.7 * width else width
+    return float(np.sqrt(0.75 * np.sqrt(np.pi) * np.mean((blur2 + width**2) ** 3) / width**5)) * ratio
 
 
 def glint_deviation(energy_e: float, spread_px: float, background_e: float, read_e: float, well_e: float) -> float:

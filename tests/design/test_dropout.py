@@ -134,6 +134,12 @@ def test_the_extractor_adds_to_the_noise_of_the_sensor():
     assert (found.outline_px > 1.1 * alone.outline_px).all()
     assert (found.glint_px > alone.glint_px).all()
     assert found.fixation_deg == alone.fixation_deg
+    # Light in the pupil: without read noise, s / d grows by sqrt(1 + g) / (1 - g) with the glare g.
+    bare, veiled = (er.design.extracted_noise(scene.with_({"lens.glare": glare})).outline_px[0] for glare in (0.0, 0.2))
+    assert veiled / bare == pytest.approx(np.sqrt(1.2) / 0.8, rel=0.01)
+    # A blur that differs along and across the motion: the mean of both variances, with one filter for both.
+    both, mean = ridge_deviation(0.0, 1e6, [1.0, 1.5], 0.0), [ridge_deviation(0.0, 1e6, b, 0.0) for b in (1.0, 1.5)]
+    assert both == pytest.approx(np.sqrt(np.mean(np.square(mean))))
 
 
 def test_noise_of_a_ridge_is_that_of_edges_found_in_noise():
