@@ -117,7 +117,7 @@ def test_refusals():
     line[:, 2] = 0.0
     with pytest.raises(InputError, match="do not determine a homography"):
         Homography().fit(seen.with_targets(line), WORLD)
-    with pytest.raises(InputError, match="there is no light 3: the rig has 2"):
+    with pytest.raises(InputError, match="needs 4 lights, but the rig has 2"):
         Homography().fit(seen, rig([CAMERA], LIGHTS[:2], (650, 0, 0)))
     both = data(eyes=(0, 1))
     only = Homography().fit(seen, WORLD).predict(both, WORLD)

@@ -268,7 +268,7 @@ BAD = [
     ([*FIT, "regression", "--fixations", "0,a", "-o", "c.json"], "--fixations"),
     ([*FIT, "regression", "--fixations", "99", "-o", "c.json"], "no fixation 99"),
     ([*FIT, "regression", "--fixations", "0", "-o", "c.json"], "R3 has 6"),
-    ([*FIT, "homography", "-o", "c.json"], "no light 3: the rig has 2"),
+    ([*FIT, "homography", "-o", "c.json"], "needs 4 lights, but the rig has 2"),
     ([*FIT, "shih-wu-liu", "-o", "c.json"], "two cameras"),
     ([*FIT, "guestrin-eizenman", "--index", "0.5", "-o", "c.json"], "index"),
     (["gaze", "fit", "empty.jsonl", "--estimator", "regression", "-o", "c.json"], "holds no records"),
