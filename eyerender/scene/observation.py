@@ -450,7 +450,7 @@ class Observations(ArrayValue):
                 residual_mm=reader.array("pose.residual_mm", ()),
             ),
             pupil=pupil,
-            glints=GlintFeatures(**reader.glints("glints")),
+            glints=GlintFeatures(**reader.glints("glints", reader.rows("glints"))),
             lens_glints=reader.lens_glints(),
             ghost_glints=reader.ghost_glints(),
             purkinje=reader.purkinje(),
@@ -643,17 +643,17 @@ class _Reader:
     def ghost_glints(self) -> GlintFeatures | None:
         if all(entries is None for entries in self.values("ghost_glints")):
             return None
-        return GlintFeatures(**self.glints("ghost_glints"))
+        return GlintFeatures(**self.glints("ghost_glints", self.rows("ghost_glints")))
 
     def purkinje(self) -> PurkinjeFeatures | None:
         """Read the Purkinje images, which have no covariance."""
-        rows = self.values("purkinje")
-        if all(entries is None for entries in rows):
+        if all(entries is None for entries in self.values("purkinje")):
             return None
-        found = self.glints("purkinje", without="covariance")
+        rows = self.rows("purkinje")
+        found = self.glints("purkinje", rows, without="covariance")
         order = np.full(found["light"].shape, -1, np.int64)
         for k, entries in enumerate(rows):
-            for j, one in enumerate(entries[: order.shape[1]] if isinstance(entries, list) else ()):
+            for j, one in enumerate(entries):
                 number = one.get("order") if isinstance(one, dict) else None
                 if number not in (1, 2, 3, 4):
                     self.refuse(k, f"purkinje.{j}", "needs order, 1 to 4")
@@ -662,13 +662,13 @@ class _Reader:
         return PurkinjeFeatures(**found, order=order)
 
     def lens_glints(self) -> LensGlintFeatures | None:
-        rows = self.values("lens_glints")
-        if all(entries is None for entries in rows):
+        if all(entries is None for entries in self.values("lens_glints")):
             return None
-        found = self.glints("lens_glints")
+        rows = self.rows("lens_glints")
+        found = self.glints("lens_glints", rows)
         surface, index = (np.full(found["light"].shape, -1, np.int64) for _ in range(2))
         for k, entries in enumerate(rows):
-            for j, one in enumerate(entries[: index.shape[1]] if isinstance(entries, list) else ()):
+            for j, one in enumerate(entries):
                 name, number = (one.get("surface"), one.get("index")) if isinstance(one, dict) else (None, None)
                 if name not in SURFACES or not _is_count(number):
                     self.refuse(k, f"lens_glints.{j}", "needs surface, front or back, and index, a whole number")
@@ -676,14 +676,18 @@ class _Reader:
                     surface[k, j], index[k, j] = SURFACES.index(name), number
         return LensGlintFeatures(**found, surface=surface, index=index)
 
-    def glints(self, key: str, without: str = "") -> dict[str, Any]:
-        """Read glints; entries lack the key `without`."""
+    def rows(self, key: str) -> list[list[Any]]:
+        """Return the list of each record, empty for null; what is no list, or too long, is refused, and empty too."""
         absent = not self.complete or key != "glints"
         rows = [[] if entries is None and absent else entries for entries in self.values(key)]
         for k, entries in enumerate(rows):
             if not isinstance(entries, list) or len(entries) > _MAX_ENTRIES:
                 self.refuse(k, key, f"must be a list of at most {_MAX_ENTRIES}")
                 rows[k] = []
+        return rows
+
+    def glints(self, key: str, rows: list[list[Any]], without: str = "") -> dict[str, Any]:
+        """Read the glints of rows; entries lack the key `without`."""
         n, m = len(rows), max(map(len, rows), default=0)
         _check_width(n, m, MAX_GLINTS, "glints", self.problems.source)
         light, status = np.full((n, m), -1, np.int64), np.full((n, m), Status.NONE, np.int8)
