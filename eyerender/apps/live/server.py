@@ -33,9 +33,6 @@ _CLOSING_S = 0.4
 _ENDING_S = 1.2
 """Longest time between Ctrl-C and the end of the process, even while it computes, renders or serves a tab."""
 
-_SWITCH_S = 5e-4
-"""Longest time for which the painter's thread may hold the interpreter while the page waits for it."""
-
 
 def serve(
     scene: Scene,
@@ -54,7 +51,6 @@ def serve(
     """
     with _listening(port) as listener:
         painter = Painter(backend=backend, threads=threads)
-        sys.setswitchinterval(_SWITCH_S)
         deadline = threading.Timer(_ENDING_S, _end)
         deadline.daemon = True
         try:
